@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from ..errors import MissingFileError
+from ..errors import InvalidInputError, MissingFileError
 from ..geometry import rotation_from_viewpoint
 from .images import read_image
 
 Sample = dict[str, Any]
+JointTransform = Callable[[Any, Sample], tuple[Any, Sample]]
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".JPEG", ".JPG", ".PNG", ".tif", ".tiff")
 
 
@@ -26,10 +27,13 @@ class ObjectDataset(Dataset[Sample]):
 
     Args:
         root: the folder of the dataset.
-        transform: function of the photograph (3, H, W), whose result becomes ``image``. Boxes and
-            cameras are not adapted: it may change colours, not the geometry; :func:`crops` cuts
-            boxes out.
+        transform: function of the photograph (3, H, W), whose result becomes ``image``. It may
+            change colours, not the geometry, since boxes, cameras and poses stay: a result of
+            another size is refused, a flip cannot be seen. :func:`crops` cuts boxes out.
         target_transform: function of the sample without its ``image``, which returns a dict.
+        transforms: function of both, which returns both, as in torchvision:
+            ``transforms(image, sample) -> (image, sample)``; the place for what moves pixels. It
+            comes last.
     """
 
     def __init__(
@@ -38,10 +42,12 @@ class ObjectDataset(Dataset[Sample]):
         *,
         transform: Callable[[Tensor], Any] | None = None,
         target_transform: Callable[[Sample], Sample] | None = None,
+        transforms: JointTransform | None = None,
     ) -> None:
         self.root = root
         self.transform = transform
         self.target_transform = target_transform
+        self.transforms = transforms
         self.skipped_items: dict[str, list[str]] = {}
         # Numbers instead of tensors: thousands of small tensors exhaust file handles when a worker
         # is spawned.
@@ -84,8 +90,16 @@ class ObjectDataset(Dataset[Sample]):
         image = read_image(sample["image_path"])
         if self.target_transform is not None:
             sample = self.target_transform(sample)
-        sample["image"] = image if self.transform is None else self.transform(image)
-        return sample
+        pixels = image if self.transform is None else self.transform(image)
+        if _is_of_another_size(pixels, image):
+            raise InvalidInputError(
+                f"transform: made {tuple(pixels.shape)} of a photograph {tuple(image.shape)}, "
+                "whose box, camera and pose do not follow; change the size by transforms=, a "
+                "function of image and sample, or use cr.data.crops"
+            )
+        if self.transforms is not None:
+            pixels, sample = self.transforms(pixels, sample)
+        return {**sample, "image": pixels}
 
     def _checked(self, index: object) -> int:
         try:
@@ -98,6 +112,11 @@ class ObjectDataset(Dataset[Sample]):
         if not -len(self) <= number < len(self):
             raise IndexError(f"{type(self).__name__}: has {len(self)} objects, got index {number}")
         return number
+
+
+def _is_of_another_size(pixels: Any, image: Tensor) -> bool:
+    """Whether the result of a transform is a picture of another height or width."""
+    return isinstance(pixels, Tensor) and pixels.ndim >= 2 and pixels.shape[-2:] != image.shape[-2:]
 
 
 def existing_root(root: str | os.PathLike[str], readme: str) -> Path:

@@ -14,7 +14,14 @@ from ..formats.cameras.record import flattened
 from ..geometry.cameras import projected_boxes, transform
 from ..utils.checks import check_camera_matrix, check_rotation
 from ..utils.files import finite_numbers, read_json
-from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, existing_root, is_plain_name
+from ._base import (
+    IMAGE_SUFFIXES,
+    JointTransform,
+    ObjectDataset,
+    Sample,
+    existing_root,
+    is_plain_name,
+)
 from .bop_models import BOPModels
 
 _README = "datasets/bop/README.md"
@@ -33,7 +40,7 @@ class BOPDataset(ObjectDataset):
             object the ``inst_count`` most visible ones; False selects all; None is True for
             ``split="test"`` if the file exists.
         models: folder of the meshes, such as ``"models_cad"``.
-        transform, target_transform: see :class:`ObjectDataset`.
+        transform, target_transform, transforms: see :class:`ObjectDataset`.
 
     Attributes:
         models_info: obj_id -> entry of ``models/models_info.json``, symmetries included; without
@@ -74,9 +81,13 @@ class BOPDataset(ObjectDataset):
         models: str = "models",
         transform: Callable[[Tensor], Any] | None = None,
         target_transform: Callable[[Sample], Sample] | None = None,
+        transforms: JointTransform | None = None,
     ) -> None:
         super().__init__(
-            existing_root(root, _README), transform=transform, target_transform=target_transform
+            existing_root(root, _README),
+            transform=transform,
+            target_transform=target_transform,
+            transforms=transforms,
         )
         self.split = split
         scenes = self.root / split

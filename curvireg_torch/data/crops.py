@@ -45,6 +45,11 @@ class ObjectCrops(Dataset[dict[str, Tensor]]):
             raise InvalidInputError(
                 f"dataset: expected one of curvireg_torch.data, got {type(dataset).__name__}"
             )
+        if dataset.transforms is not None:
+            raise InvalidInputError(
+                "dataset: crops are cut by the boxes as annotated, which its transforms may move; "
+                "make it without transforms="
+            )
         check_integer(size, "size")
         check_positive(margin, "margin", zero_ok=True)
         if not hasattr(bins, "__len__") or len(bins) != len(_ANGLES):

@@ -12,7 +12,15 @@ from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.checks import check_option
-from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, existing_root, is_plain_name, pose_fields
+from ._base import (
+    IMAGE_SUFFIXES,
+    JointTransform,
+    ObjectDataset,
+    Sample,
+    existing_root,
+    is_plain_name,
+    pose_fields,
+)
 from .mat_files import MatStruct, MatValue, read_mat
 
 _README = "datasets/pascal3d/README.md"
@@ -35,7 +43,7 @@ class Pascal3DPlus(ObjectDataset):
         occluded, truncated, difficult: False skips objects with that flag.
         pixel_origin: coordinate of the first pixel in ``bbox``, ``px`` and ``py``: 1 in the release
             (MATLAB), 0 in sets written from Python. It is subtracted.
-        transform, target_transform: see :class:`ObjectDataset`.
+        transform, target_transform, transforms: see :class:`ObjectDataset`.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
@@ -78,9 +86,13 @@ class Pascal3DPlus(ObjectDataset):
         pixel_origin: int = 1,
         transform: Callable[[Tensor], Any] | None = None,
         target_transform: Callable[[Sample], Sample] | None = None,
+        transforms: JointTransform | None = None,
     ) -> None:
         super().__init__(
-            existing_root(root, _README), transform=transform, target_transform=target_transform
+            existing_root(root, _README),
+            transform=transform,
+            target_transform=target_transform,
+            transforms=transforms,
         )
         check_option(part, ("pascal", "imagenet"), "part")
         if pixel_origin not in (0, 1):

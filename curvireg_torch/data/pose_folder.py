@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.choices import MESHES
 from ..utils.files import read_csv
-from ._base import ObjectDataset, Sample, existing_root, is_plain_name, pose_fields
+from ._base import JointTransform, ObjectDataset, Sample, existing_root, is_plain_name, pose_fields
 
 _README = "datasets/web/README.md"
 _COLUMNS = ["image", "x0", "y0", "x1", "y1", "azimuth", "elevation", "theta", "distance"]
@@ -28,7 +28,7 @@ class PoseFolder(ObjectDataset):
 
     Args:
         root: the folder of the objects' folders.
-        transform, target_transform: see :class:`ObjectDataset`.
+        transform, target_transform, transforms: see :class:`ObjectDataset`.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
@@ -56,9 +56,13 @@ class PoseFolder(ObjectDataset):
         *,
         transform: Callable[[Tensor], Any] | None = None,
         target_transform: Callable[[Sample], Sample] | None = None,
+        transforms: JointTransform | None = None,
     ) -> None:
         super().__init__(
-            existing_root(root, _README), transform=transform, target_transform=target_transform
+            existing_root(root, _README),
+            transform=transform,
+            target_transform=target_transform,
+            transforms=transforms,
         )
         folders = sorted(
             p for p in self.root.iterdir() if p.is_dir() and not p.name.startswith(".")

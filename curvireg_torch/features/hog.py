@@ -3,12 +3,11 @@
 import math
 
 import torch
-from torch import Tensor, nn
-from torch.nn.utils import parametrize
+from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..filters import operations as ops
-from ..filters.modules import FunctionModule, Positive
+from ..filters.modules import FunctionModule
 from ..utils.checks import check_fraction, check_integer, check_tensor
 
 # relative to the longest block of the image; normalisation suppresses shorter ones
@@ -160,9 +159,9 @@ def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
     return blocks.flatten(1)
 
 
-class HOG(FunctionModule):
+class HOG(FunctionModule, learnable=("bin_weights",)):
     """Module twin of :func:`hog`: (B, 2, H, W) to (B, D), D = ``length``. ``learnable`` makes
-    ``bin_weights`` (bins,), initially 1, a positive parameter; otherwise it is None.
+    ``bin_weights`` (bins,), initially 1, positive parameters; otherwise it is None.
 
     Example:
         >>> layer = HOG(grid=4)
@@ -170,7 +169,6 @@ class HOG(FunctionModule):
         (torch.Size([2, 324]), 324)
     """
 
-    bin_weights: Tensor | None
     grid: int
     bins: int
     block: int
@@ -185,10 +183,9 @@ class HOG(FunctionModule):
         learnable: bool = False,
     ) -> None:
         _check_options(grid, bins, block, clip)
-        super().__init__(grid=grid, bins=bins, block=block, clip=clip)
-        self.bin_weights = nn.Parameter(torch.ones(bins)) if learnable else None
-        if learnable:
-            parametrize.register_parametrization(self, "bin_weights", Positive())
+        weights = torch.ones(bins) if learnable else None
+        options = {"grid": grid, "bins": bins, "block": block, "clip": clip}
+        super().__init__(self._learnable if learnable else (), **options, bin_weights=weights)
 
     @property
     def length(self) -> int:
@@ -198,7 +195,7 @@ class HOG(FunctionModule):
     def with_quarter_turn(self, field: Tensor) -> tuple[Tensor, Tensor]:
         """Descriptors (B, D) of square fields (B, 2, S, S), and of the same rotated clockwise by 90
         degrees, at three quarters of the time of both."""
-        both = _hog(field, bin_weights=self.bin_weights, **self.options, with_quarter_turn=True)
+        both = _hog(field, **self.options, with_quarter_turn=True)
         upright, sideways = both.chunk(2, dim=1)
         return upright, sideways
 
@@ -210,7 +207,7 @@ class HOG(FunctionModule):
         return cells.flip(1, 2, 3, 4).flatten(1)
 
     def forward(self, field: Tensor) -> Tensor:
-        return hog(field, bin_weights=self.bin_weights, **self.options)
+        return hog(field, **self.options)
 
 
 def field_points(field: Tensor, *, fraction: float = 0.04) -> Tensor:

@@ -211,6 +211,7 @@ class LearnedCurvilinearSaliency(nn.Module):
         weight = self.network.head.weight
         # Resized in float32 at least: on a CPU, torch has no antialiasing of half types.
         x = ops.fill_missing(image.to(ops.at_least_float32(weight[:0]).dtype)).expand(-1, 3, -1, -1)
+        ops.warn_of_range(x, "the network was trained on these")
         if size != [H, W]:
             x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True)
         x = self.network(x.to(weight.dtype).contiguous(memory_format=torch.channels_last))

@@ -132,9 +132,9 @@ def depth_curvilinear_saliency(
     check_option(formula, FORMULAS, "formula")
 
     def layer(z: Tensor) -> ops.Planes:
-        factor, *m = _shape_operator(z, formula)
+        factor, m11, m12, m21, m22 = _shape_operator(z, formula)
         sign = 1.0 if formula == "paper" else None
-        vx, vy, half_gap = dominant_eigenvector(*m, sign=sign)
+        vx, vy, half_gap = dominant_eigenvector(m11, m12, m21, m22, sign)
         return scaled_direction(factor.mul_(half_gap), vx, vy)
 
     return apply_to_depth(layer, depth, mask, sigma, depth_scale)

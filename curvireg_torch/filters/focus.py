@@ -72,7 +72,9 @@ def _edge_blur(
     """Blur of the edge through each pixel of ``x``, whose gradient is (gx, gy), for each
     re-blurring."""
     saliency = ops.squared_length(gx, gy)
-    variance, fourth = _difference_moments(gx, saliency)
+    # 1 and 0 instead of tiny numbers, whose quotients have no finite second derivative
+    flat = saliency <= ops.safe_eps(saliency)
+    variance, fourth = _difference_moments(gx, torch.where(flat, 1.0, saliency))
     blurs = []
     for sigma in reblur_sigmas:
         if mode == "reblur-image":
@@ -85,7 +87,8 @@ def _edge_blur(
             reblurred = ops.smooth(saliency, sigma, margin=0)
             numerator = 2.0 * sigma**2 * reblurred.square()
             denominator = saliency.square() - reblurred.square()
-        numerator = numerator + ops.safe_eps(numerator)
+        numerator = torch.where(flat, 1.0, numerator + ops.safe_eps(numerator))
+        denominator = torch.where(flat, 0.0, denominator)
         quotient = numerator / torch.maximum(denominator, numerator / (MAX_BLUR**2 + variance))
         measured = torch.maximum(quotient, variance)
         remainder = fourth * (measured.reciprocal() + (measured + sigma**2).reciprocal())
@@ -98,9 +101,10 @@ def _difference_moments(gx: Tensor, saliency: Tensor) -> tuple[Tensor, Tensor]:
 
     By the series of erf, an edge of blur s has :math:`CS \propto 1/(s^2 + v + e/s^2)` up to the
     order of 1/s^6, with the variance :math:`v = \frac13 (g_x^4 + g_y^4)/|g|^4` and
-    :math:`e = v^2 - \frac7{90}(g_x^6 + g_y^6)/|g|^6`. Returns v in px^2 and e in px^4.
+    :math:`e = v^2 - \frac7{90}(g_x^6 + g_y^6)/|g|^6`. Returns v in px^2 and e in px^4. The
+    ``saliency`` is positive.
     """
-    along_x = gx * gx / saliency.clamp(min=ops.safe_eps(saliency))
+    along_x = gx * gx / saliency
     product = along_x * (1.0 - along_x)  # g_x^2 g_y^2 / |g|^4
     variance = (1.0 - 2.0 * product) / 3.0
     fourth = variance.square() - (7.0 / 90.0) * (1.0 - 3.0 * product)

@@ -2,25 +2,33 @@
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils import parametrize
 
 from ..utils.checks import check_positive
 
 
-class Positive(nn.Module):
-    """Parametrization of a positive parameter by its logarithm, so that any optimiser step keeps it
-    positive."""
+def _positive_option(name: str) -> property:
+    """Attribute ``name`` of a module: a fixed value, or one by its logarithm, the parameter
+    ``log_NAME``, so that any optimiser step keeps it positive. (torch's parametrizations do the
+    same, but their modules cannot be pickled.)"""
 
-    def forward(self, log: Tensor) -> Tensor:
-        return log.exp()
+    def value(self: "FunctionModule") -> Any:
+        log = self._parameters.get(f"log_{name}")
+        return self._fixed[name] if log is None else log.exp()
 
-    def right_inverse(self, value: Tensor) -> Tensor:
-        return value.log()
+    def assign(self: "FunctionModule", new: Any) -> None:
+        log = self._parameters.get(f"log_{name}")
+        if log is None:
+            self._fixed[name] = new
+            return
+        with torch.no_grad():
+            log.copy_(torch.as_tensor(new, dtype=torch.float64).log())
+
+    return property(value, assign)
 
 
 class FunctionModule(nn.Module):
@@ -31,12 +39,15 @@ class FunctionModule(nn.Module):
     options positive parameters."""
 
     _function: ClassVar[Callable[..., Tensor]]
+    _learnable: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(
         cls, *, function: Callable[..., Tensor] | None = None, learnable: tuple[str, ...] = ()
     ):
         super().__init_subclass__()
-        # a further subclass, such as those that torch derives for parametrized modules
+        for name in learnable:
+            setattr(cls, name, _positive_option(name))
+        cls._learnable = (*cls._learnable, *learnable)
         if function is None:
             return
         cls._function = staticmethod(function)
@@ -73,14 +84,16 @@ class FunctionModule(nn.Module):
     def __init__(self, learnable: tuple[str, ...] = (), **options: Any) -> None:
         super().__init__()
         self._names = tuple(options)
+        self._fixed: dict[str, Any] = {}
         for name, value in options.items():
             if name in learnable:
-                self.register_parameter(
-                    name, nn.Parameter(torch.tensor(check_positive(value, name)))
-                )
-                parametrize.register_parametrization(self, name, Positive())
+                start = value if isinstance(value, Tensor) else check_positive(value, name)
+                log = torch.as_tensor(start, dtype=torch.float64).log().float()
+                self.register_parameter(f"log_{name}", nn.Parameter(log))
             elif name == "camera_matrix":
-                self.register_buffer(name, value, persistent=False)
+                # not all devices have float64
+                camera = value.float() if isinstance(value, Tensor) else value
+                self.register_buffer(name, camera, persistent=False)
             else:
                 setattr(self, name, tuple(value) if isinstance(value, list) else value)
 
@@ -93,13 +106,40 @@ class FunctionModule(nn.Module):
         return self._function(image, **self.options)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move a camera matrix between devices, but keep its dtype: ``.half()`` would round it."""
+        """Move a camera matrix between devices, but keep float32: ``.half()`` would round it."""
         camera = self._buffers.get("camera_matrix")
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         moved = self._buffers.get("camera_matrix")
         if camera is not None and moved is not None:
             self._buffers["camera_matrix"] = camera.to(moved.device)
         return self
+
+    def _load_from_state_dict(
+        self,
+        state_dict: Mapping[str, Any],
+        prefix: str,
+        local_metadata: Any,
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        """Say what to do about the state of a learnable module in a fixed one, and the reverse."""
+        lists = missing_keys, unexpected_keys
+        super()._load_from_state_dict(
+            state_dict, prefix, local_metadata, strict, *lists, error_msgs
+        )
+        kind = type(self).__name__
+        for name in self._learnable:
+            key = f"{prefix}log_{name}"
+            hints = (
+                f"is a parameter of {kind}(learnable=True), and {name} is fixed here; build the "
+                f"module with learnable=True",
+                f"is no part of the state of {kind}(learnable=False); pass {name} to the "
+                f"constructor, and load with strict=False to keep it",
+            )
+            for keys, hint in zip((unexpected_keys, missing_keys), hints, strict=True):
+                keys[:] = [f"{key} {hint}" if one == key else one for one in keys]
 
     def extra_repr(self) -> str:
         options = self.options

@@ -33,12 +33,16 @@ def anisotropic_diffusion(
         image: (B, C, H, W); channels diffuse independently. NaN pixels are missing and filled.
         iterations: number of steps, >= 0.
         kappa: difference in grey levels above which an edge is preserved, > 0; a scalar tensor is
-            differentiable.
+            differentiable. It has the unit of the image: 0.03 is for [0, 1], about 8 for [0, 255].
         step: time step in (0, 0.25]; larger steps are unstable.
         conductance: ``"rational"`` or ``"exponential"``.
 
     Returns:
         (B, C, H, W) with the mean of the input and values within its range.
+
+    Warns:
+        CurviregWarning: of an image beyond [-0.01, 1.01], as of 0 to 255 or normalised ones, with a
+            kappa below 0.2, by which hardly anything is smoothed.
 
     Example:
         >>> anisotropic_diffusion(torch.rand(1, 3, 16, 16), iterations=5).shape
@@ -53,9 +57,23 @@ def anisotropic_diffusion(
         raise InvalidInputError(f"step: expected 0 < step <= 0.25 (stability), got {step}")
 
     def layer(x: Tensor) -> ops.Planes:
-        return (diffuse(ops.fill_missing(x), iterations, kappa, step, conductance),)
+        filled = ops.fill_missing(x)
+        warn_of_unit(filled, kappa)
+        return (diffuse(filled, iterations, kappa, step, conductance),)
 
     return ops.apply_in_blocks(layer, ops.at_least_float32(image)).to(image.dtype)
+
+
+LARGEST_KAPPA = 0.2  # that is meant for images in [0, 1]
+
+
+def warn_of_unit(image: Tensor, kappa: float | Tensor) -> None:
+    """Warn of grey levels in another unit than kappa's, where it can be read."""
+    if isinstance(kappa, Tensor) and not ops.is_host_readable(kappa):
+        return
+    number = float(kappa.detach()) if isinstance(kappa, Tensor) else kappa
+    if number < LARGEST_KAPPA:
+        ops.warn_of_range(image, f"kappa = {number:.3g}, a difference of grey levels, is for these")
 
 
 def diffuse(
@@ -100,7 +118,7 @@ def multiscale_curvilinear_saliency(
         image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
         scales: number n of levels, after 0, 5, 10, 20, ... steps of 0.2 of diffusion.
         sigma: smoothing in px before differentiation, >= 0.
-        kappa: of :func:`anisotropic_diffusion`, which smooths the levels.
+        kappa: of :func:`anisotropic_diffusion`, which smooths the levels and warns alike.
 
     Returns:
         (B, 2, H, W): length in [0, 1], direction of the gradient at the level with the largest
@@ -117,6 +135,7 @@ def multiscale_curvilinear_saliency(
     contrast = ops.check_scalar(kappa, "kappa")
 
     def layer(image: Tensor) -> ops.Planes:
+        warn_of_unit(image, contrast)
         level = image
         field, saliency = _normalised_saliency(level, checked_sigma)
         lowest = saliency

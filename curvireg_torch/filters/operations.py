@@ -2,6 +2,7 @@
 suppression of non-maxima."""
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
@@ -10,8 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..errors import InvalidInputError
+from ..errors import CurviregWarning, InvalidInputError
 from ..utils.checks import check_colour_image, check_positive, check_tensor
+from ..utils.precision import exact_convolutions
 
 
 def safe_eps(x: Tensor) -> float:
@@ -38,6 +40,12 @@ def full_precision(x: Tensor) -> AbstractContextManager[object]:
     if device == "meta" or not torch.is_autocast_enabled(device):
         return nullcontext()
     return torch.autocast(device, enabled=False)
+
+
+def _without_tf32(x: Tensor) -> AbstractContextManager[object]:
+    """Convolutions of a GPU with all 24 bits."""
+    on_gpu = x.device.type == "cuda" and torch.backends.cudnn.allow_tf32
+    return exact_convolutions() if on_gpu else nullcontext()
 
 
 def at_least_float32(x: Tensor) -> Tensor:
@@ -67,7 +75,7 @@ def check_scalar(value: float | Tensor, name: str, *, zero_ok: bool = False) -> 
     check_tensor(value, name, ())
     if is_host_readable(value):
         check_positive(float(value.detach()), name, zero_ok=zero_ok)
-    return value
+    return at_least_float32(value)
 
 
 def check_sigmas(sigmas: Sequence[float], name: str) -> list[float]:
@@ -104,6 +112,7 @@ def stack_channels(*planes: Tensor) -> Tensor:
     return torch.stack([plane.squeeze(1) for plane in planes], dim=1)
 
 
+USUAL_RANGE = (-0.01, 1.01)  # of grey levels; resized images overshoot a little
 # holes of up to 2^5 px are filled from their surroundings, the middle of larger ones with the mean
 MAX_HOLE_LEVELS = 5
 
@@ -115,15 +124,45 @@ def apply_to_photograph(
     ``missing_value``."""
     check_colour_image(image)
 
-    def on_filled(x: Tensor) -> Planes:
+    def on_filled(x: Tensor, mask: Tensor) -> Planes:
+        planes = layer(fill_missing(x, mask))
+        return tuple(torch.where(mask, missing_value, plane) for plane in planes)
+
+    def on_photographs(x: Tensor) -> Planes:
         if not may_have_missing(x):
             return layer(x)
         mask = missing_mask(x)
-        return tuple(
-            torch.where(mask, missing_value, plane) for plane in layer(fill_missing(x, mask))
-        )
+        if not is_host_readable(x) or not _has_empty_border(mask):
+            return on_filled(x, mask)
+        # Each of a padded batch by itself, without what is padded: as it would be alone.
+        parts = [_on_inside(on_filled, *one) for one in zip(x.split(1), mask.split(1), strict=True)]
+        padded = [
+            [F.pad(plane, beyond, value=missing_value) for plane in planes]
+            for planes, beyond in parts
+        ]
+        return tuple(torch.cat(planes) for planes in zip(*padded, strict=True))
 
-    return apply_in_blocks(on_filled, to_grey(at_least_float32(image))).to(image.dtype)
+    return apply_in_blocks(on_photographs, to_grey(at_least_float32(image))).to(image.dtype)
+
+
+def _has_empty_border(mask: Tensor) -> bool:
+    """Whether the first or the last row or column of an image is missing."""
+    sides = (mask[..., 0, :], mask[..., -1, :], mask[..., 0], mask[..., -1])
+    return any(bool(side.all(dim=-1).any()) for side in sides)
+
+
+def _on_inside(
+    layer: Callable[[Tensor, Tensor], Planes], x: Tensor, mask: Tensor
+) -> tuple[Planes, tuple[int, int, int, int]]:
+    """``layer`` of the bounding box of the valid pixels of one image, and what F.pad has to add:
+    left, right, top, bottom. An image without any is its own box."""
+    H, W = x.shape[-2:]
+    valid = ~mask[0, 0]
+    rows = valid.any(dim=1).nonzero().flatten().tolist() or [0, H - 1]
+    columns = valid.any(dim=0).nonzero().flatten().tolist() or [0, W - 1]
+    inside = (..., slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+    beyond = (columns[0], W - 1 - columns[-1], rows[0], H - 1 - rows[-1])
+    return layer(x[inside], mask[inside]), beyond
 
 
 def to_grey(image: Tensor) -> Tensor:
@@ -149,12 +188,15 @@ def missing_mask(x: Tensor) -> Tensor:
 
 
 def fill_missing(x: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Fill missing pixels of (B, C, H, W), by default those not finite, with the mean of the
-    smallest pyramid cell that has a valid pixel; an image without any becomes 0."""
+    """Fill missing pixels of (B, C, H, W), by default those not finite: outside of the valid
+    pixels' bounding box, as in a padded batch, with the nearest pixel of the box, as at the border
+    of an image; inside with the mean of the smallest pyramid cell that has a valid pixel. An image
+    without any becomes 0."""
     if mask is None:
         if not may_have_missing(x):
             return x
         mask = missing_mask(x)
+    x, mask = _replicated_box(x, mask)
     sums = [torch.where(mask, 0.0, x)]
     weights = [(~mask).to(x.dtype)]
     for _ in range(MAX_HOLE_LEVELS):
@@ -169,6 +211,36 @@ def fill_missing(x: Tensor, mask: Tensor | None = None) -> Tensor:
         fill = torch.where(weight > 0, total / weight.clamp(min=tiny), coarser)
         fill = F.interpolate(fill, scale_factor=2.0, mode="nearest")
     return torch.where(mask, fill[..., : x.shape[-2], : x.shape[-1]], x)
+
+
+def _replicated_box(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """``x`` and ``mask`` with the pixels outside of the bounding box of those that are valid
+    replaced by the nearest ones in it."""
+    for dim, other in ((-2, -1), (-1, -2)):
+        last = x.shape[dim] - 1
+        index = torch.arange(last + 1, device=x.device)
+        index = index[:, None] if dim == -2 else index
+        seen = ~mask.all(dim=other, keepdim=True)
+        low = torch.where(seen, index, last).amin(dim=dim, keepdim=True)
+        high = torch.where(seen, index, 0).amax(dim=dim, keepdim=True)
+        nearest = torch.minimum(torch.maximum(index, low), high).expand_as(x)
+        x = x.gather(dim, nearest)
+        mask = mask.gather(dim, nearest)
+    return x, mask
+
+
+def warn_of_range(image: Tensor, reason: str) -> None:
+    """Warn of an image beyond ``USUAL_RANGE`` whose values are readable; ``reason`` ends a
+    sentence: why it matters."""
+    if not is_host_readable(image) or image.numel() == 0:
+        return
+    low, high = (float(level) for level in image.detach().aminmax())
+    if low < USUAL_RANGE[0] or high > USUAL_RANGE[1]:
+        message = (
+            f"expected grey levels in [0, 1], got {low:.3g} to {high:.3g}, and {reason}; divide by "
+            f"255 or undo the normalisation"
+        )
+        warnings.warn(CurviregWarning(message, subject="image"), stacklevel=5)
 
 
 def zero_nonfinite_vectors(field: Tensor) -> Tensor:
@@ -204,39 +276,62 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
 def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = False) -> Tensor:
     """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite
     differences need it: ``linear`` by the slope at the borders, else by replicating them."""
-    weights = _gaussian_kernel(sigma, x)
-    radius = len(weights) // 2
-    x = (extrapolate_pad if linear else replicate_pad)(x, radius + margin)
-    if radius == 0:
+    pad = extrapolate_pad if linear else replicate_pad
+    readable = not isinstance(sigma, Tensor) or is_host_readable(sigma)
+    if prefers_shifts() or not readable:
+        weights = _gaussian_kernel(sigma, x)
+        return _weighted_shifts(pad(x, len(weights) // 2 + margin), weights)
+    from kornia.filters import gaussian_blur2d  # here, because its import takes 0.3 s
+
+    width = _kernel_radius(sigma)
+    beyond = width if linear else 0  # kornia replicates the borders itself
+    x = pad(x, beyond + margin)
+    if width == 0:
         return x
-    # Sums of shifted images: much faster than a convolution on few images, and one loop when
-    # compiled.
+    both: Any = (sigma, sigma)
+    if isinstance(sigma, Tensor):
+        both = sigma.to(x.dtype).clamp(min=MIN_TENSOR_SIGMA).expand(1, 2)
+    with full_precision(x), _without_tf32(x):
+        blurred: Tensor = gaussian_blur2d(x, 2 * width + 1, both, "replicate")
+    H, W = (side - 2 * beyond for side in x.shape[-2:])
+    return blurred[..., beyond : beyond + H, beyond : beyond + W]
+
+
+def prefers_shifts() -> bool:
+    """Whether sums of shifted images take the place of kornia's convolutions: in graphs, where they
+    fuse with what surrounds them (docs/kornia.md has the times)."""
+    return torch.compiler.is_compiling()
+
+
+def _weighted_shifts(x: Tensor, weights: Sequence[float] | Tensor) -> Tensor:
+    """The separable correlation of ``x`` with ``weights``, where it lies in ``x``."""
     for dim in (-1, -2):
         padded = x
-        length = x.shape[dim] - 2 * radius
+        length = x.shape[dim] - len(weights) + 1
         x = padded.narrow(dim, 0, length) * weights[0]
-        for i in range(1, 2 * radius + 1):
-            part = padded.narrow(dim, i, length)
-            x = (
-                x.addcmul_(part, weights[i])
-                if isinstance(weights, Tensor)
-                else x.add_(part, alpha=weights[i])
-            )
+        for i in range(1, len(weights)):
+            x = x + padded.narrow(dim, i, length) * weights[i]
     return x
+
+
+def _kernel_radius(sigma: float | Tensor) -> int:
+    """Of a kernel in px; that of a tensor that cannot be read is the largest."""
+    if not isinstance(sigma, Tensor):
+        return math.ceil(4.0 * sigma)
+    if not is_host_readable(sigma):
+        return MAX_TENSOR_RADIUS
+    return min(max(math.ceil(4.0 * float(sigma.detach())), 1), MAX_TENSOR_RADIUS)
 
 
 def _gaussian_kernel(sigma: float | Tensor, like: Tensor) -> Sequence[float] | Tensor:
     """Weights of a kernel of odd length: floats for a float, a tensor for a tensor."""
+    radius = _kernel_radius(sigma)
     if not isinstance(sigma, Tensor):
-        radius = math.ceil(4.0 * sigma)
         kernel = [
             math.exp(-0.5 * (i / sigma) ** 2) if i else 1.0 for i in range(-radius, radius + 1)
         ]
         total = sum(kernel)
         return [weight / total for weight in kernel]
-    radius = MAX_TENSOR_RADIUS
-    if is_host_readable(sigma):
-        radius = min(max(math.ceil(4.0 * float(sigma.detach())), 1), radius)
     sigma = sigma.to(like.dtype).clamp(min=MIN_TENSOR_SIGMA)
     offsets = torch.arange(-radius, radius + 1, device=like.device, dtype=like.dtype)
     weights = torch.exp(-0.5 * (offsets / sigma) ** 2) * (offsets.abs() <= torch.ceil(4.0 * sigma))
@@ -266,19 +361,34 @@ def extrapolate_pad(x: Tensor, radius: int) -> Tensor:
 
 def central_gradient(p: Tensor) -> tuple[Tensor, Tensor]:
     """(p_x, p_y) per px by central differences; the result is 1 px smaller than p on each side."""
-    return _half_difference(p[..., 1:-1, 2:], p[..., 1:-1, :-2]), _half_difference(
-        p[..., 2:, 1:-1], p[..., :-2, 1:-1]
-    )
+    if prefers_shifts():
+        return _half_difference(p[..., 1:-1, 2:], p[..., 1:-1, :-2]), _half_difference(
+            p[..., 2:, 1:-1], p[..., :-2, 1:-1]
+        )
+    x, y = _differences(p, order=1)
+    return x, y
 
 
 def central_derivatives(p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """(p_x, p_y, p_xx, p_yy, p_xy) per px and px^2; each is 1 px smaller than p on each side."""
+    if not prefers_shifts():
+        xx, xy, yy = _differences(p, order=2)
+        return *central_gradient(p), xx, yy, xy
     x = p[..., 1:-1, 1:-1]
     slope = _half_difference(p[..., 2:], p[..., :-2])
     xx = (p[..., 1:-1, 2:] + p[..., 1:-1, :-2]).sub_(x, alpha=2)
     yy = (p[..., 2:, 1:-1] + p[..., :-2, 1:-1]).sub_(x, alpha=2)
     xy = _half_difference(slope[..., 2:, :], slope[..., :-2, :])
     return slope[..., 1:-1, :], _half_difference(p[..., 2:, 1:-1], p[..., :-2, 1:-1]), xx, yy, xy
+
+
+def _differences(p: Tensor, *, order: int) -> tuple[Tensor, ...]:
+    """kornia's derivatives of one order, without the border that has a replicated neighbour."""
+    from kornia.filters import spatial_gradient  # here, because its import takes 0.3 s
+
+    with full_precision(p), _without_tf32(p):
+        found: Tensor = spatial_gradient(p, "diff", order)
+    return found[..., 1:-1, 1:-1].unbind(2)
 
 
 def _half_difference(after: Tensor, before: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from ..geometry import ViewSphere, rotation_from_viewpoint, viewpoint_from_rotation
 from ..geometry.viewpoint import PAPER_RADIUS
-from ..matching import Ranking, ViewMatcher
+from ..matching import Ranking, ViewBank, ViewMatcher
 from ..matching.bank import view_frame
 from ..mesh import mesh_radius
 from ..terms import QueryFeatures
@@ -69,7 +69,9 @@ def motion(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> float
 
 
 @torch.no_grad()
-def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tuple[Tensor, Tensor]:
+def search(
+    matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking, *, least_coherent: int = 1
+) -> tuple[Tensor, Tensor]:
     """Return the rotation (3, 3) and the distance () in model units, float64, of the view that
     matches one photograph best, between the least and the greatest angles and distances of the
     coherent ones of its three best views.
@@ -79,6 +81,10 @@ def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tupl
     the coherent views of the round before. The search ends where the best pose moves by
     :data:`STOP_MOTION` or less. An orthographic camera does not see the distance: views that differ
     in nothing else count as one, and that of the best view stays.
+
+    Mostly the best view has no coherent one among the three, and nothing is searched ("at least the
+    highest three"). ``least_coherent`` = 2 takes views down the ranking until one is coherent with
+    it (docs/paper.md has the effect).
     """
     bank = matcher.bank
     frame = view_frame(bank.mesh, bank.pipeline.views)
@@ -94,11 +100,10 @@ def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tupl
     farther = DISTANCE_STEP
     pose = rotations[order[0]], distances[order[0]]
     for _ in range(MAX_ROUNDS):
-        best = order[:BEST_VIEWS] if perspective else different_views(rotations, order, BEST_VIEWS)
-        near = angles_near(angles[best], angles[best[0]])
-        coherent = coherent_views(near, steps)
-        chosen = near[coherent]
-        away = distances[best[coherent]]
+        best, chosen = _coherent(
+            rotations, angles, order, steps, least=least_coherent, with_distance=perspective
+        )
+        away = distances[best]
         low = chosen.amin(dim=0).tolist()
         high = chosen.amax(dim=0).tolist()
         axes = [divided(a, b, width) for a, b in zip(low, high, strict=True)]
@@ -108,9 +113,7 @@ def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tupl
         *columns, distances = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
         angles = torch.stack(columns, dim=1)
         rotations = rotation_from_viewpoint(*columns)
-        azimuth, elevation, theta = (column.float() for column in columns)
-        views = ViewSphere(azimuth, elevation, theta, distances.float()).in_frame(frame)
-        order = matcher.compare_views(query, views).argsort(descending=True, stable=True).cpu()
+        order = _ranked(matcher, query, columns, distances)
         found = rotations[order[0]], distances[order[0]]
         moved = motion(pose, found)
         pose = found
@@ -120,6 +123,65 @@ def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tupl
         width = width / 2.0
         farther = farther / 2.0
     return pose[0] @ frame, pose[1] * mesh_radius(bank.mesh)
+
+
+def _ranked(
+    matcher: ViewMatcher, query: QueryFeatures, columns: list[Tensor], distances: Tensor
+) -> Tensor:
+    """(N,) the order of views of azimuths, elevations and thetas, the best one first."""
+    frame = view_frame(matcher.bank.mesh, matcher.bank.pipeline.views)
+    azimuth, elevation, theta = (column.float() for column in columns)
+    views = ViewSphere(azimuth, elevation, theta, distances.float()).in_frame(frame)
+    return matcher.compare_views(query, views).argsort(descending=True, stable=True).cpu()
+
+
+def _coherent(
+    rotations: Tensor,
+    angles: Tensor,
+    order: Tensor,
+    steps: tuple[float, float, float],
+    *,
+    least: int,
+    with_distance: bool,
+) -> tuple[Tensor, Tensor]:
+    """(K,) the views of ``order`` that are coherent with the first, of its best three, or of more
+    until there are ``least``, and their (K, 3) angles."""
+    count = BEST_VIEWS
+    while True:
+        best = order[:count] if with_distance else different_views(rotations, order, count)
+        near = angles_near(angles[best], angles[best[0]])
+        coherent = coherent_views(near, steps)
+        if int(coherent.sum()) >= least or len(best) < count:
+            return best[coherent], near[coherent]
+        count += 1
+
+
+def coherent_of(bank: ViewBank, ranking: Ranking) -> Tensor:
+    """(K,) the views between which :func:`search` begins, for one photograph."""
+    frame = view_frame(bank.mesh, bank.pipeline.views)
+    rotations = bank.rotations.cpu().double() @ frame.T
+    angles = torch.stack(viewpoint_from_rotation(rotations), dim=1)
+    perspective = bank.settings.camera == "perspective"
+    order = ranking.order[0].cpu()
+    return _coherent(rotations, angles, order, NEIGHBOUR_STEPS, least=1, with_distance=perspective)[
+        0
+    ]
+
+
+@torch.no_grad()
+def refine(matcher: ViewMatcher, query: QueryFeatures, view: int) -> Tensor:
+    """(3, 3) float64 the best of nine views: one of the bank, and those :data:`ANGLE_STEP` beside
+    it in azimuth and elevation."""
+    bank = matcher.bank
+    frame = view_frame(bank.mesh, bank.pipeline.views)
+    rotation = bank.rotations[view].cpu().double() @ frame.T
+    azimuth, elevation, theta = (angle.double() for angle in viewpoint_from_rotation(rotation))
+    steps = torch.tensor([-ANGLE_STEP, 0.0, ANGLE_STEP], dtype=torch.float64)
+    axes = (azimuth + steps, elevation + steps, theta[None])
+    columns = [axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij")]
+    distances = bank.views.distance[view].cpu().double().expand(len(columns[0]))
+    best = _ranked(matcher, query, columns, distances)[0]
+    return rotation_from_viewpoint(*columns)[best] @ frame
 
 
 def different_views(rotations: Tensor, order: Tensor, count: int) -> Tensor:

@@ -22,11 +22,18 @@ from curvireg_torch.filters import (
     MultiScaleCurvilinearSaliency,
     MultiScaleFocusCurves,
 )
+from curvireg_torch.filters.focus import PAPER_THRESHOLD
 from curvireg_torch.geometry import pose_from_box, rotation_error, viewpoint_from_rotation
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import FIELDS, PRESETS, BankSettings, Pipeline, ViewPolicy
-from curvireg_torch.registration.search import BEST_VIEWS, different_views, search
+from curvireg_torch.registration.search import (
+    BEST_VIEWS,
+    coherent_of,
+    different_views,
+    refine,
+    search,
+)
 from scripts.paper.cases import Case
 from scripts.paper.detectors import DETECTORS
 from scripts.paper.measures import (
@@ -51,6 +58,10 @@ EPS = (1.0, 2.0, 3.0, 4.0)
 SHARES = (0.01, 0.02, 0.04, 0.08)
 RANKS = (1, 3, 5, 10, 20)
 BEST_PAIR = "CS/MFC"
+REFINED_PAIRS = ("CS/MFC", "CS/MCS")
+RIGHT_DEG = 30.0
+KNOWN_AZIMUTH_DEG = 45.0
+THRESHOLDS = (0.001, PAPER_THRESHOLD, 0.01, 0.03, 0.06, 0.1)
 
 
 def variants(pose: str) -> dict[str, Pipeline]:
@@ -62,9 +73,23 @@ def variants(pose: str) -> dict[str, Pipeline]:
     return {"literal": literal, "printed": printed, "corrected": corrected}
 
 
+def focus_fields() -> dict[str, nn.Module]:
+    """Focus curves of every threshold, alone and weighted by CS, then the fields beside them."""
+    weights = {"MFC": 0.0, "MFC x CS": 1.0}
+    curves = {
+        f"{name} {threshold:.4f}": MultiScaleFocusCurves(
+            saliency_weight=weight, threshold=threshold
+        )
+        for name, weight in weights.items()
+        for threshold in THRESHOLDS
+    }
+    return {**curves, "MCS": MultiScaleCurvilinearSaliency(), "IG": ImageGradient()}
+
+
 def photo_fields(variant: str) -> dict[str, nn.Module]:
     """The paper's filters of photographs."""
-    focus = FIELDS["MFC"]() if variant == "literal" else MultiScaleFocusCurves(saliency_weight=0.0)
+    exact = MultiScaleFocusCurves(saliency_weight=0.0, threshold=PAPER_THRESHOLD)
+    focus = FIELDS["MFC"]() if variant == "literal" else exact
     return {"MFC": focus, "MCS": MultiScaleCurvilinearSaliency(), "IG": ImageGradient()}
 
 
@@ -199,12 +224,19 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
                 matcher.field = fields[photo]
                 for b, case in enumerate(cases):
                     found = _ranked(matcher, crops[b], case, truths[b], errors[b], describe)
+                    if variant == "corrected" and f"{depth}/{photo}" in REFINED_PAIRS:
+                        found["refined"] = _closest_refined(
+                            matcher, crops[b], case, truths[b], describe
+                        )
                     records[b].setdefault(variant, {})[f"{depth}/{photo}"] = found
         limit = errors.argmin(dim=1)
         for b, case in enumerate(cases):
             records[b][variant]["limit"] = _pose_errors(
                 bank.rotations[limit[b]], case, truths[b], describe
             )
+            # what a ranking by lot and the best one would have
+            records[b][variant]["chance"] = float((errors[b] < RIGHT_DEG).double().mean())
+            records[b][variant]["ceiling"] = float(errors[b].min() < RIGHT_DEG)
             records[b][variant]["grid 8"] = records[b][variant][BEST_PAIR]["top"][0]
         for grid in (4, 16):
             given = replace(pipeline, bank=replace(bank_settings, grid=grid))
@@ -230,13 +262,84 @@ def _ranked(
     # Views at several distances are one picture to an orthographic camera.
     top = different_views(matcher.bank.rotations, ranking.order[0], max(RANKS))
     rotation, _ = search(matcher, query, ranking)
+    wider, _ = search(matcher, query, ranking, least_coherent=2)
     retrieved = top[:BEST_VIEWS]
     closest = retrieved[errors[retrieved].argmin()]
     return {
         "top": errors[top].tolist(),
         "est": _pose_errors(rotation, case, truth, describe),
+        "found": float(rotation_error(truth, rotation)),
+        "coherent": len(coherent_of(matcher.bank, ranking)),
+        "wider": _pose_errors(wider, case, truth, describe),
+        "wider found": float(rotation_error(truth, wider)),
         "clo": _pose_errors(matcher.bank.rotations[closest], case, truth, describe),
     }
+
+
+def _closest_refined(
+    matcher: ViewMatcher, crop: Tensor, case: Case, truth: Tensor, describe: ViewDescriber
+) -> list[float]:
+    """Errors of the closest of the three retrieved views, each replaced by the best of a grid of 5°
+    as far as half way to the next view of the bank."""
+    query = matcher.features(crop[None])
+    order = matcher.rank(query).order[0]
+    refined = [
+        refine(matcher, query, int(view))
+        for view in different_views(matcher.bank.rotations, order, BEST_VIEWS)
+    ]
+    closest = min(refined, key=lambda R: float(rotation_error(truth, R)))
+    return _pose_errors(closest, case, truth, describe)
+
+
+@torch.no_grad()
+def measure_focus(cases: list[Case], settings: BankSettings, pose: str) -> list[Record]:
+    """IP and the best views of focus curves by threshold, and of the fields beside them, in the
+    ranking "corrected"; and what of them is right by other protocols."""
+    mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
+    pipeline = variants(pose)["corrected"]
+    pipeline = replace(
+        pipeline,
+        bank=replace(pipeline.bank, image_size=settings.image_size, margin=settings.margin),
+    )
+    bank = ViewBank.build(mesh, pipeline=pipeline, progress=False)
+    matcher = ViewMatcher(bank, pipeline=pipeline)
+    fields = focus_fields()
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    rotations = bank.rotations.double()
+    records: list[Record] = []
+    for case in cases:
+        crop = case.crop(settings)
+        R, distance = case.view(mesh)
+        true_field = matcher.describer.fields(R[None], torch.tensor([distance]).double())
+        view = field_points(true_field, fraction=settings.point_fraction)[0, 0]
+        errors = rotation_error(R, rotations)
+        turned = torch.minimum(errors, rotation_error(R @ half_turn, rotations))
+        azimuths = torch.stack([viewpoint_from_rotation(one)[0] for one in (R, *rotations)])
+        apart = ((azimuths[1:] - azimuths[0] + 180.0) % 360.0 - 180.0).abs()
+        near = apart <= KNOWN_AZIMUTH_DEG
+        right = (errors < RIGHT_DEG).double()
+        record: Record = {
+            "chance": {
+                "right": float(right.mean()),
+                "half turn": float((turned < RIGHT_DEG).double().mean()),
+                "azimuth": float(right[near].mean()),
+                "top 20": 1.0 - (1.0 - float(right.mean())) ** 20,
+            }
+        }
+        for name, field in fields.items():
+            matcher.field = field
+            query = matcher.features(crop)
+            order = matcher.rank(query).order[0]
+            photo = query.points[0, 0]
+            record[name] = {
+                "ip": float(intersection_percentage(photo, view)),
+                "right": float(errors[order[0]]),
+                "half turn": float(turned[order[0]]),
+                "azimuth": float(errors[order[near[order]][0]]),
+                "top 20": float(errors[order[:20]].min()),
+            }
+        records.append(record)
+    return records
 
 
 def _pose_errors(

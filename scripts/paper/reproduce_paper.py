@@ -16,6 +16,8 @@ TABLE is one of
 - angles: errors of elevation, azimuth, in-plane angle and distance, of the estimate and of the
   closest retrieved view
 - grids: precision with descriptors of 4, 8 and 16 cells
+- search: in how many photographs the paper's search has something to search, and its effect
+- focus: focus curves by threshold, and precision by other protocols
 - all
 
 Every table states what was measured, the number of photographs, and 95 % intervals. Only objects
@@ -59,26 +61,30 @@ OF_VIEWS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
     "ranks": paper.rank_tables,
     "angles": paper.angle_tables,
     "grids": paper.grid_tables,
+    "search": paper.search_tables,
 }
-TABLES = (*OF_POINTS, *OF_VIEWS)
+OF_FOCUS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {"focus": paper.focus_tables}
+TABLES = (*OF_FOCUS, *OF_POINTS, *OF_VIEWS)
 ON_PAGE = ("detectors", "ip_classes", "hausdorff_classes", "repeatability", "curve", "precision")
 ON_PAGE += ("precision_classes", *(f"ranks_{variant}" for variant in paper.VARIANTS))
-ON_PAGE += (*(f"angles_{variant}" for variant in paper.VARIANTS), "grids", "sensitivity")
-PHASES = {"points": OF_POINTS, "views": OF_VIEWS}
+ON_PAGE += (*(f"angles_{variant}" for variant in paper.VARIANTS), "search", "grids")
+ON_PAGE += ("protocols", "thresholds", "sensitivity")
+PHASES = {"focus": OF_FOCUS, "points": OF_POINTS, "views": OF_VIEWS}
 
 
 def measure(
     phase: str, cases: list[Case], settings: BankSettings, pose: str
 ) -> list[dict[str, Any]]:
     """Records of the cases of one mesh."""
-    from scripts.paper.measure import measure_points, measure_views
+    from scripts.paper.measure import measure_focus, measure_points, measure_views
 
     start = time.process_time()
-    found = (
-        measure_points(cases, settings)
-        if phase == "points"
-        else measure_views(cases, settings, pose)
-    )
+    if phase == "points":
+        found = measure_points(cases, settings)
+    elif phase == "focus":
+        found = measure_focus(cases, settings, pose)
+    else:
+        found = measure_views(cases, settings, pose)
     seconds = (time.process_time() - start) / len(cases)
     same = {"cad": cases[0].mesh_path, "seconds": seconds, "commit": commit()}
     names = [{"category": case.category, **same} for case in cases]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from curvireg_torch.filters.focus import PAPER_THRESHOLD
 from curvireg_torch.utils.files import write_csv, write_file
 from scripts._shared import table_lines
 from scripts.paper import printed
@@ -275,12 +276,30 @@ def _right(variant: str, pair: str, rank: int) -> Value:
     return lambda record: float(min(record[variant][pair]["top"][:rank]) < RIGHT_DEG)
 
 
+def limit_rows(records: Records, columns: int) -> list[list[Cell]]:
+    """What views drawn by lot, and the best view of the bank, would have, for each variant."""
+    return [
+        [
+            name,
+            *(records.mean(at(variant, key)) for variant in VARIANTS),
+            *["-"] * (columns - 1 - len(VARIANTS)),
+        ]
+        for name, key in (("a view by lot", "chance"), ("a right view is there", "ceiling"))
+    ]
+
+
+def _by_lot(variant: str, count: int) -> Value:
+    """The probability that one of ``count`` views by lot is right."""
+    return lambda record: 1.0 - (1.0 - number(record[variant]["chance"])) ** count
+
+
 def precision_tables(records: Records) -> list[Table]:
     """Fraction of the photographs whose best view is nearly right."""
     rows: list[list[Cell]] = []
     for pair in PAIRS:
         cells = [records.mean(_right(variant, pair, 1)) for variant in VARIANTS]
         rows.append([pair, *cells, _printed(printed.PRECISION[pair], 2)])
+    rows += limit_rows(records, 5)
     text = (
         f"Fraction of the photographs whose best view is within {RIGHT_DEG:g}° of the true one "
         f"(the paper does not "
@@ -320,7 +339,12 @@ def rank_tables(records: Records) -> list[Table]:
     columns = ["depth / photograph", *(f"k = {k}" for k in RANKS)]
     tables = []
     for variant in VARIANTS:
-        rows = [[pair, *(records.mean(_right(variant, pair, k)) for k in RANKS)] for pair in PAIRS]
+        rows: list[list[Cell]] = [
+            [pair, *(records.mean(_right(variant, pair, k)) for k in RANKS)] for pair in PAIRS
+        ]
+        rows.append(["views by lot", *(records.mean(_by_lot(variant, k)) for k in RANKS)])
+        ceiling = records.mean(at(variant, "ceiling"))
+        rows.append(["a right view is there", *[ceiling] * len(RANKS)])
         tables.append(
             Table(f"ranks_{variant}", f"Precision at rank k, {NAMES[variant]}", text, columns, rows)
         )
@@ -335,9 +359,9 @@ def angle_tables(records: Records) -> list[Table]:
         "fills the box, with the "
         "camera of the annotation; the paper's centimetres are of unknown objects). Est.: after "
         "the search. Clo.: the "
-        "closest of the three retrieved views. Bank: the closest of all its views. Angles of "
-        "symmetric objects count "
-        f"in full. {records.text}"
+        "closest of the three retrieved views; of refined views: each the best of a grid of 5°, as "
+        "an azimuth of 1.2° on a grid of 20° must be. Bank: the closest of all its views. Angles "
+        f"of symmetric objects count in full. {records.text}"
     )
     tables = []
     for variant in VARIANTS:
@@ -349,6 +373,11 @@ def angle_tables(records: Records) -> list[Table]:
                 for kind in ("est", "clo")
             ]
             rows.append([pair, *cells])
+            if all("refined" in record[variant][pair] for record in records.records):
+                refined = (records.mean(at(variant, pair, "refined", k)) for k in range(4))
+                rows.append(
+                    [f"{pair}, of refined views", *(c for cell in refined for c in ("-", cell))]
+                )
             if pair in printed.POSE_ERRORS:
                 rows.append([f"{pair}, paper", *printed.POSE_ERRORS[pair]])
         limits = [cell for k in range(4) for cell in ("-", records.mean(at(variant, "limit", k)))]
@@ -358,6 +387,80 @@ def angle_tables(records: Records) -> list[Table]:
             Table(f"angles_{variant}", f"Errors of the pose, {NAMES[variant]}", text, columns, rows)
         )
     return tables
+
+
+def search_tables(records: Records) -> list[Table]:
+    """What the search does, and what it would with views down the ranking."""
+    rows: list[list[Cell]] = []
+
+    def more(variant: str, pair: str) -> Value:
+        return lambda record: float(record[variant][pair]["coherent"] > 1)
+
+    def found(variant: str, pair: str, key: str) -> Value:
+        return lambda record: float(record[variant][pair][key] < RIGHT_DEG)
+
+    for variant in VARIANTS:
+        for pair in PAIRS[:3]:
+            kinds = ("found", "wider found")
+            values = (more(variant, pair), _right(variant, pair, 1))
+            values += tuple(found(variant, pair, kind) for kind in kinds)
+            rows.append([f"{NAMES[variant]}, {pair}", *(records.mean(one) for one in values)])
+    text = (
+        "More than one: photographs in which one of the best three views is coherent with the "
+        f"best, so that something lies between them. Precision within {RIGHT_DEG:g}° of the best "
+        "view, after the search, and after it with views down the ranking until two are coherent. "
+        f"{records.text}"
+    )
+    columns = ["depth / photograph", "more than one", "before", "after", "down the ranking"]
+    return [Table("search", "What the search does", text, columns, rows)]
+
+
+def focus_tables(records: Records) -> list[Table]:
+    """Focus curves by threshold, and protocols of precision."""
+
+    def right(name: str, protocol: str) -> Value:
+        return lambda record: float(record[name][protocol] < RIGHT_DEG)
+
+    names = [name for name in records.records[0] if name.startswith("MFC ")]
+    thresholds = sorted({name.split()[-1] for name in names})
+    rows: list[list[Cell]] = []
+    for threshold in thresholds:
+        cells: list[Cell] = []
+        for curve in ("MFC", "MFC x CS"):
+            name = f"{curve} {threshold}"
+            cells += [records.mean(at(name, "ip")), records.mean(right(name, "right"))]
+        rows.append([threshold, *cells])
+    for name in ("MCS", "IG"):
+        ip, share = records.mean(at(name, "ip")), records.mean(right(name, "right"))
+        rows.append([name, ip, share, "-", "-"])
+    text = (
+        "Least CS of an edge, relative to the largest (the paper: e⁻⁵ = .0067, as for MCS): IP, "
+        "and precision of the corrected ranking, of focus curves alone and weighted by CS. "
+        f"{records.text}"
+    )
+    columns = ["threshold", "MFC, IP", "precision", "MFC x CS, IP", "precision "]
+    tables = [Table("thresholds", "Threshold of focus curves", text, columns, rows)]
+    shown = (f"MFC {PAPER_THRESHOLD:.4f}", f"MFC x CS {PAPER_THRESHOLD:.4f}", "MCS", "IG")
+    rows = []
+    for name, protocol in PROTOCOLS.items():
+        chance = records.mean(at("chance", protocol))
+        cells = [records.mean(right(field, protocol)) for field in shown]
+        rows.append([name, *cells, chance])
+    text = (
+        "The same rankings (corrected, CS of depth) by other protocols than the rotation of the "
+        f"best view within {RIGHT_DEG:g}°. {records.text}"
+    )
+    columns = ["protocol", "MFC", "MFC x CS", "MCS", "IG", "chance"]
+    tables.append(Table("protocols", "Protocols of precision", text, columns, rows))
+    return tables
+
+
+PROTOCOLS = {
+    "best view": "right",
+    "half turns about the vertical are right": "half turn",
+    "azimuth known within 45°": "azimuth",
+    "among the best 20": "top 20",
+}
 
 
 def number(value: float | None) -> float:
@@ -374,6 +477,7 @@ def grid_tables(records: Records) -> list[Table]:
     rows = [
         [f"{g} x {g}", *(records.mean(right(variant, g)) for variant in VARIANTS)] for g in GRIDS
     ]
+    rows += limit_rows(records, 4)
     text = (
         f"Precision of CS/MFC by the cells of the descriptor; the paper says that 8 x 8 is "
         f"best. "

@@ -142,7 +142,8 @@ class LayerContract:
         step."""
         x = case.inputs(1, 9, seed=3, dtype=torch.float64)
         generator = torch.Generator().manual_seed(0)
-        x = x + 0.05 * torch.rand(x.shape, generator=generator, dtype=torch.float64) * (x > 0)
+        noise = torch.rand(x.shape, generator=generator, dtype=torch.float64)
+        x = 0.95 * x + 0.05 * noise * (x > 0)  # in the range of images
         # Pixels of 0 may be background of a depth image, which a step would make visible.
         index = (x != 0).nonzero(as_tuple=True)
         weights = self.gradcheck_weights(case, x)

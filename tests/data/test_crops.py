@@ -181,6 +181,28 @@ def test_datasets_transform_images_and_targets(dataset: ObjectDataset) -> None:
     )
 
 
+def test_a_transform_of_image_and_labels_may_move_pixels(dataset: ObjectDataset) -> None:
+    """A transform of the image alone may not: box, camera and pose would not follow."""
+    make = type(dataset)
+    options = {"targets": False} if make is BOPDataset else {}
+    plain = dataset[0]
+    half = make(dataset.root, transform=lambda image: image[:, ::2, ::2], **options)
+    H, W = plain["image"].shape[1:]
+    with pytest.raises(InvalidInputError, match=rf"of a photograph \(3, {H}, {W}\).*transforms="):
+        half[0]
+
+    def halve(image: torch.Tensor, sample: dict) -> tuple[torch.Tensor, dict]:
+        return image[:, ::2, ::2], {**sample, "box": sample["box"] / 2}
+
+    together = make(dataset.root, transform=lambda image: 1 - image, transforms=halve, **options)
+    sample = together[0]
+    assert torch.equal(sample["image"], 1 - plain["image"][:, ::2, ::2])
+    assert torch.equal(sample["box"], plain["box"] / 2)
+    assert torch.equal(together.annotation(0)["box"], plain["box"])
+    with pytest.raises(InvalidInputError, match="without transforms="):
+        crops(together, 16)
+
+
 def test_datasets_say_what_they_are(dataset: ObjectDataset) -> None:
     name = type(dataset).__name__
     split = {"Pascal3DPlus": ", split='val'", "BOPDataset": ", split='test'", "PoseFolder": ""}[

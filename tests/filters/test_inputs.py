@@ -5,7 +5,9 @@ import math
 import pytest
 import torch
 
+import curvireg_torch as cr
 from curvireg_torch import filters
+from curvireg_torch.errors import CurviregWarning
 from curvireg_torch.features import field_points, hog
 from curvireg_torch.filters.operations import fill_missing, to_grey
 
@@ -58,9 +60,78 @@ def test_fill_missing_uses_the_surroundings() -> None:
         )
         assert float(gradient.max()) < 2.5
     large = torch.zeros_like(ramp, dtype=torch.bool)
-    large[..., :, 2:] = True  # beyond the reach of the pyramid: the mean of the valid pixels
+    large[..., :, 30:] = True  # outside of what is valid: the nearest pixel, as at the border
     filled = fill_missing(ramp.masked_fill(large, math.nan), large)
-    assert float(filled[..., -1].max()) == pytest.approx(0.5)
+    assert bool((filled[..., 30:] == 29.0).all())
+
+
+@pytest.mark.filterwarnings("ignore:There is a performance drop")
+@every_photo_layer
+@pytest.mark.parametrize("corner", [(0, 0), (5, 9)])
+def test_a_padded_batch_gives_what_each_photograph_alone_gives(
+    layer: LayerCase, corner: tuple[int, int]
+) -> None:
+    """Pixels beyond the photograph are outside, as its border is: no edge where it ends."""
+    alone = photos(1, 40, dtype=torch.float64)
+    other = photos(1, 64, seed=1, dtype=torch.float64)
+    top, left = corner
+    padded = torch.full_like(other, math.nan)
+    padded[..., top : top + 40, left : left + 40] = alone
+    found = layer(torch.cat([padded, other]))
+    want = layer(alone)
+    part = found[:1, :, top : top + 40, left : left + 40]
+    # diffusion goes on in what lies outside
+    tolerance = 0.01 if layer.name.startswith("diffusion") else 1e-12
+    torch.testing.assert_close(part, want, rtol=0.0, atol=tolerance * float(want.abs().max()))
+    torch.testing.assert_close(found[1:], layer(other))
+    # in a graph, whose sizes cannot depend on pixels, it is as if the border were replicated
+    traced = torch.func.vmap(layer)(torch.cat([padded, other])[None])[0]
+    if layer.name in ("ig", "ics", "pci"):
+        torch.testing.assert_close(traced, found)
+
+
+@pytest.mark.parametrize("unit", ["0 to 255", "normalised"])
+@every_photo_layer
+def test_images_in_another_unit_give_the_same_field_or_a_warning(
+    layer: LayerCase, unit: str
+) -> None:
+    image = photos(1, 32)
+    scaled = 255.0 * image if unit == "0 to 255" else (image - 0.449) / 0.226
+    if layer.name.startswith(("mcs", "diffusion")):
+        with pytest.warns(CurviregWarning, match=r"image: expected grey levels in \[0, 1\], got"):
+            layer(scaled)
+        layer.function(255.0 * image, **{**layer.options, "kappa": 0.03 * 255.0})  # in its unit
+        return
+    field = layer(image)
+    other = layer(scaled)
+    factor = float((field * other).sum() / (field * field).sum())
+    assert factor > 0.0
+    torch.testing.assert_close(
+        other, factor * field, rtol=1e-3, atol=1e-3 * float(other.abs().max())
+    )
+
+
+def test_the_learned_field_warns_of_images_in_another_unit() -> None:
+    with pytest.warns(CurviregWarning, match="the network was trained on these"):
+        cr.LearnedCurvilinearSaliency()(255.0 * photos(1, 32))
+
+
+@every_photo_layer
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradient_penalties_are_finite_where_images_are_flat(
+    layer: LayerCase, dtype: torch.dtype
+) -> None:
+    flat = torch.full((1, 1, 12, 12), 0.7, dtype=dtype)
+    half = torch.where(torch.arange(12) >= 6, flat, 0.2)
+    holes = torch.where(torch.arange(12) >= 9, math.nan, flat)
+    for image in (0.0 * flat, flat, half, holes):
+        x = image.clone().requires_grad_()
+        y = layer(x)
+        (slope,) = torch.autograd.grad(y.square().sum() + y.sum(), x, create_graph=True)
+        assert bool(torch.isfinite(slope).all())
+        if slope.requires_grad:
+            (curvature,) = torch.autograd.grad(slope.square().sum(), x)
+            assert bool(torch.isfinite(curvature).all())
 
 
 @every_photo_layer

@@ -2,12 +2,15 @@
 their dtype."""
 
 import copy
+import io
+import pickle
 from collections.abc import Callable
 
 import pytest
 import torch
 from torch import nn
 
+import curvireg_torch as cr
 from curvireg_torch import filters
 from curvireg_torch.errors import InvalidInputError
 
@@ -71,7 +74,7 @@ def test_depth_layers_broadcast_masks() -> None:
 
 
 @pytest.mark.parametrize("module", [filters.AverageShadingGradient, filters.ApparentRidges])
-def test_perspective_modules_keep_the_dtype_of_their_camera(
+def test_perspective_modules_keep_the_precision_of_their_camera(
     module: Callable[..., nn.Module],
 ) -> None:
     camera = CAMERA.clone()
@@ -86,6 +89,10 @@ def test_perspective_modules_keep_the_dtype_of_their_camera(
         assert torch.equal(half(depth), want)
     assert module(camera_matrix=camera).to("meta").camera_matrix.device.type == "meta"
     assert module().half().camera_matrix is None
+    # float64 would exclude devices that do not have it
+    double = module(camera_matrix=camera.double())
+    assert double.camera_matrix.dtype == double.double().camera_matrix.dtype == torch.float32
+    assert torch.equal(double(depth), want)
 
 
 # At sigma 1 the kernel is about to grow by a tap, 4e-6 of its sum: enough to disturb a difference
@@ -111,7 +118,7 @@ def test_learnable_modules_start_at_their_options_with_correct_gradients(name: s
     x = inputs(2, 12, dtype=torch.float64)
     fixed = make(**options)
     module = make(**options, learnable=True).double()
-    keys = [f"parametrizations.{option}.original" for option in sorted(learnable)]
+    keys = [f"log_{option}" for option in sorted(learnable)]
     assert sorted(module.state_dict()) == keys
     assert not list(fixed.parameters())
     for option in learnable:  # the float64 number itself, not the one that float32 rounded
@@ -133,6 +140,49 @@ def test_learnable_modules_start_at_their_options_with_correct_gradients(name: s
     assert torch.autograd.gradcheck(
         function, parameters, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True
     )
+
+
+@pytest.mark.parametrize("name", list(MODULES))
+def test_learnable_modules_can_be_pickled_saved_and_halved(name: str) -> None:
+    make, options, inputs, learnable = MODULES[name]
+    module = make(**options, learnable=True)
+    for option in learnable:
+        setattr(module, option, 1.5 * getattr(module, option))
+    x = inputs(2, 16)
+    copies = [pickle.loads(pickle.dumps(module))]
+    file = io.BytesIO()
+    torch.save(module, file)
+    file.seek(0)
+    copies.append(torch.load(file, weights_only=False))
+    other = make(**options, learnable=True)
+    other.load_state_dict(module.state_dict())
+    for one in (*copies, other):
+        assert torch.equal(one(x), module(x))
+        assert one.options.keys() == module.options.keys()
+        assert list(one.state_dict()) == list(module.state_dict())
+    half = copies[0].half()
+    found = half(x.half())
+    assert found.dtype == torch.float16
+    field = module(x)
+    close = (found.float() - field).abs() <= 0.02 * field.abs().max()
+    assert float(close.float().mean()) > 0.99
+    assert half(x).dtype == torch.float32
+
+
+def test_state_of_learnable_and_fixed_modules_says_what_to_do() -> None:
+    fixed = nn.Sequential(filters.ImageGradient(sigma=2.0), cr.HOG())
+    learnt = nn.Sequential(filters.ImageGradient(learnable=True), cr.HOG(learnable=True))
+    message = r"0\.log_sigma is a parameter of ImageGradient\(learnable=True\).*learnable=True"
+    with pytest.raises(RuntimeError, match=message) as raised:
+        fixed.load_state_dict(learnt.state_dict())
+    assert "1.log_bin_weights is a parameter of HOG(learnable=True)" in str(raised.value)
+    message = r"0\.log_sigma is no part of the state of ImageGradient\(learnable=False\).*strict"
+    with pytest.raises(RuntimeError, match=message):
+        learnt.load_state_dict(fixed.state_dict())
+    learnt.load_state_dict(fixed.state_dict(), strict=False)
+    assert float(learnt[0].sigma.detach()) == 1.0
+    fixed[0].sigma = 3.0
+    assert fixed[0].options == {"sigma": 3.0}
 
 
 def test_learnable_options_reject_values_that_are_not_positive() -> None:

@@ -99,12 +99,21 @@ class TwoPeaks(Peak):
         return torch.maximum(super().scores(views), second)
 
 
+class Scattered(Peak):
+    """The best view has no neighbour among the best three: 100 and 180 degrees of azimuth follow."""
+
+    def scores(self, views: Any) -> Tensor:
+        far = ((views.azimuth - 140.0).abs().round() == 40.0) & (views.elevation.abs() < 1.0)
+        return torch.where(far, -0.6, super().scores(views))
+
+
 def searched(
     *truth: float,
     camera: str = "perspective",
     frame: str = "own",
     allowed: tuple[float, float] = (0.0, 360.0),
     kind: type[Peak] = Peak,
+    least_coherent: int = 1,
 ) -> tuple[float, float, Any]:
     """Error of the rotation in degrees and distance in radii that the search finds on a bank of
     neighbours, some of which are allowed, and the matcher."""
@@ -123,7 +132,8 @@ def searched(
     order = matcher.scores(views).argsort(descending=True, stable=True)[None]
     inside = ((grid.azimuth >= allowed[0]) & (grid.azimuth <= allowed[1]))[None]
     ranking: Any = type("Ranking", (), {"order": order, "allowed": inside})()
-    rotation, found = search.search(matcher, None, ranking)
+    matcher.ranking = ranking
+    rotation, found = search.search(matcher, None, ranking, least_coherent=least_coherent)
     return float(rotation_error(rotation, R)), float(found) / (0.5 * 14**0.5), matcher
 
 
@@ -144,6 +154,26 @@ def test_further_rounds_are_between_views_that_are_neighbours_on_the_finer_grid(
     best = matcher.scores(first).argsort(descending=True)[:3]
     assert sorted(first.azimuth[best].round().tolist()) == [205, 205, 215]
     assert set(second.azimuth.round().tolist()) == {205}
+
+
+def test_views_down_the_ranking_give_the_search_something_to_search():
+    options = {"camera": "orthographic", "kind": Scattered}
+    error, _, matcher = searched(7.0, 0.0, 3.0, **options)
+    assert error == pytest.approx(7.0, abs=1e-3)
+    assert len(search.coherent_of(matcher.bank, matcher.ranking)) == 1
+    assert [len(views) for views in matcher.compared] == [1]
+    error, _, matcher = searched(7.0, 0.0, 3.0, **options, least_coherent=2)
+    assert sorted(set(matcher.compared[0].azimuth.round().tolist())) == [0, 5, 10, 15, 20]
+    assert error < 2.5
+
+
+def test_a_view_is_refined_among_its_neighbours():
+    _, _, matcher = searched(24.0, 46.0, 3.0)
+    wanted = rotation_from_viewpoint(25.0, 45.0)
+    view = int(rotation_error(matcher.bank.rotations, wanted).argmin())
+    refined = search.refine(matcher, None, view)
+    assert float(rotation_error(refined, wanted.double())) < 1e-3
+    assert len(matcher.compared[-1]) == 9
 
 
 def test_different_views_differ_in_rotation_however_little():

@@ -113,6 +113,55 @@ def test_rankings_find_the_true_view(views):
             assert means == sorted(means), "precision grows with k"
 
 
+def test_chance_and_ceiling_stand_below_precision(views):
+    records = tables.Records(views, "two photographs")
+    precision = tables.precision_tables(records)[0]
+    lot, ceiling = precision.rows[-2:]
+    for variant, chance, best in zip(tables.VARIANTS, lot[1:], ceiling[1:], strict=False):
+        for record in views:
+            least = min(record[variant][pair]["top"][0] for pair in measure.PAIRS)
+            assert record[variant]["ceiling"] >= float(least < 30.0)
+        assert 0.0 < chance.mean < 0.3
+        assert chance.mean <= best.mean
+    for table in tables.rank_tables(records):
+        means = [cell.mean for cell in table.rows[-2][1:]]
+        assert means == sorted(means)
+
+
+def test_the_search_says_between_how_many_views_it_searches(views):
+    for record in views:
+        for variant in tables.VARIANTS:
+            for pair in measure.PAIRS:
+                found = record[variant][pair]
+                assert 1 <= found["coherent"] <= 3
+                if found["coherent"] > 1:
+                    assert found["wider"] == found["est"]
+        for pair in measure.REFINED_PAIRS:
+            assert len(record["corrected"][pair]["refined"]) == 4
+    (table,) = tables.search_tables(tables.Records(views, "two photographs"))
+    assert len(table.rows) == 9
+
+
+def test_focus_curves_by_threshold_and_precision_by_protocol(root):
+    records = measure.measure_focus(find_cases("web", root), SETTINGS, "upright")
+    assert set(records[0]["chance"]) == set(tables.PROTOCOLS.values())
+    for record in records:
+        # upright views: a half turn is as probable, and 20 draws more so
+        chance = record["chance"]
+        assert chance["half turn"] == pytest.approx(2 * chance["right"], rel=0.3)
+        assert chance["right"] < chance["azimuth"] < chance["top 20"]
+        found = record["MCS"]
+        assert found["half turn"] <= found["right"]
+        assert found["top 20"] <= found["right"]
+        assert found["right"] == pytest.approx(0.0, abs=30.0)
+        weak = [record[f"MFC {t:.4f}"]["ip"] for t in measure.THRESHOLDS]
+        assert weak[0] < max(weak)
+    named = [{"category": "thing", "cad": "thing", **record} for record in records]
+    thresholds, protocols = tables.focus_tables(tables.Records(named, "two photographs"))
+    assert [row[0] for row in thresholds.rows[:2]] == ["0.0010", "0.0067"]
+    assert [row[0] for row in protocols.rows] == list(tables.PROTOCOLS)
+
+
 def test_closest_is_that_of_the_retrieved_views(views):
     for record in views:
         for pair in measure.PAIRS:
@@ -205,7 +254,7 @@ def test_printed_numbers_are_those_of_the_paper(label, found):
 
 def test_classes_stand_beside_the_papers():
     pairs = {pair: {"top": [10.0 if pair == "CS/MFC" else 90.0]} for pair in tables.PAIRS}
-    known = dict.fromkeys(tables.VARIANTS, pairs)
+    known = dict.fromkeys(tables.VARIANTS, {**pairs, "chance": 0.1, "ceiling": 1.0})
     record = {"cad": "a", "category": "boat", **known}
     (table,) = [
         each
