@@ -68,7 +68,11 @@ TABLES = (*OF_FOCUS, *OF_POINTS, *OF_VIEWS)
 ON_PAGE = ("detectors", "ip_classes", "hausdorff_classes", "repeatability", "curve", "precision")
 ON_PAGE += ("precision_classes", *(f"ranks_{variant}" for variant in paper.VARIANTS))
 ON_PAGE += (*(f"angles_{variant}" for variant in paper.VARIANTS), "search", "grids")
-ON_PAGE += ("protocols", "thresholds", "sensitivity")
+ON_PAGE += ("sensitivity",)
+OF_FOCUS_PAGE = ("protocols", "thresholds")
+BLOCKS = {"protocols": OF_FOCUS_PAGE, "paper": ON_PAGE}
+"""Tables between each pair of markers of the page; one that a folder has none of stays."""
+
 PHASES = {"focus": OF_FOCUS, "points": OF_POINTS, "views": OF_VIEWS}
 
 
@@ -111,7 +115,7 @@ def run(arguments: argparse.Namespace) -> None:
         for name in chosen:
             for table in makers[name](paper.Records(records, what)):
                 table.write(arguments.out)
-                if table.name in ON_PAGE:
+                if table.name in (*ON_PAGE, *OF_FOCUS_PAGE):
                     print(table.markdown(), flush=True)
             if name == "curve":
                 draw_curve(records, arguments.out / "curve.png")
@@ -187,23 +191,26 @@ def draw_curve(records: list[dict[str, Any]], path: Path) -> None:
 
 
 def write_page(folder: Path, page: Path) -> None:
-    """Replace the part of a page between its markers by the tables of a folder."""
+    """Replace the parts of a page between its markers by the tables of a folder."""
     from scripts._shared import update_page
 
     records = [
         json.loads(path.read_text(encoding="utf-8")) for path in (folder / "records").iterdir()
     ]
     commits = sorted({record["commit"] for some in records for record in some})
-    found = []
-    for name in ON_PAGE:
-        path = folder / f"{name}.md"
-        if path.exists():
-            found.append(path.read_text(encoding="utf-8"))
-        if name == "curve" and (folder / "curve.png").exists():
-            found.append(
-                f"![Repeatability in 40 views around the true one]({_picture(folder, page)})\n"
-            )
-    update_page(page, "paper", "\n".join([f"Measured at commit {', '.join(commits)}.", "", *found]))
+    for block, names in BLOCKS.items():
+        found = []
+        for name in names:
+            path = folder / f"{name}.md"
+            if path.exists():
+                found.append(path.read_text(encoding="utf-8"))
+            if name == "curve" and (folder / "curve.png").exists():
+                found.append(
+                    f"![Repeatability in 40 views around the true one]({_picture(folder, page)})\n"
+                )
+        if found:
+            lines = [f"Measured at commit {', '.join(commits)}.", "", *found]
+            update_page(page, block, "\n".join(lines))
 
 
 def _picture(folder: Path, page: Path) -> str:

@@ -8,9 +8,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from torch._dynamo.testing import CompileCounter
+
+from curvireg_torch import filters
 
 from .._support.layer_contract import LayerCase, LayerContract
-from .layer_cases import LAYERS, PAIRS, depths, equal_up_to_sign
+from .layer_cases import LAYERS, PAIRS, depths, equal_up_to_sign, photos
 
 
 class TestLayers(LayerContract):
@@ -69,6 +72,25 @@ class TestCompiled:
         graph = torch.compile(function, fullgraph=True, backend="eager")
         for options in self.values[name]:
             assert LayerContract().agrees(graph(x, **options), function(x, **options)), options
+
+
+def test_learnt_values_need_one_graph_for_all_steps() -> None:
+    torch._dynamo.reset()
+    module = filters.ImageGradient(learnable=True)
+    counter = CompileCounter()
+    graph = torch.compile(module, fullgraph=True, backend=counter)
+    x = photos(2, 16)
+    optimiser = torch.optim.SGD(module.parameters(), lr=0.1)
+    seen = []
+    for _ in range(3):
+        optimiser.zero_grad()
+        field = graph(x)
+        assert LayerContract().agrees(field, module(x))
+        field.square().sum().backward()
+        optimiser.step()
+        seen.append(float(module.sigma.detach()))
+    assert counter.frame_count == 1
+    assert len(set(seen)) == 3
 
 
 FIELDS = [

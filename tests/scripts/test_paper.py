@@ -254,7 +254,7 @@ def test_printed_numbers_are_those_of_the_paper(label, found):
 
 def test_classes_stand_beside_the_papers():
     pairs = {pair: {"top": [10.0 if pair == "CS/MFC" else 90.0]} for pair in tables.PAIRS}
-    known = dict.fromkeys(tables.VARIANTS, {**pairs, "chance": 0.1, "ceiling": 1.0})
+    known = {key: {**pairs, "chance": 0.1, "ceiling": 1.0} for key in tables.VARIANTS}
     record = {"cad": "a", "category": "boat", **known}
     (table,) = [
         each
