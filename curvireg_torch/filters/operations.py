@@ -276,25 +276,23 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
 def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = False) -> Tensor:
     """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite
     differences need it: ``linear`` by the slope at the borders, else by replicating them."""
-    pad = extrapolate_pad if linear else replicate_pad
     readable = not isinstance(sigma, Tensor) or is_host_readable(sigma)
-    if prefers_shifts() or not readable:
+    if linear or prefers_shifts() or not readable:
         weights = _gaussian_kernel(sigma, x)
+        pad = extrapolate_pad if linear else replicate_pad
         return _weighted_shifts(pad(x, len(weights) // 2 + margin), weights)
     from kornia.filters import gaussian_blur2d  # here, because its import takes 0.3 s
 
-    width = _kernel_radius(sigma)
-    beyond = width if linear else 0  # kornia replicates the borders itself
-    x = pad(x, beyond + margin)
-    if width == 0:
+    radius = _kernel_radius(sigma)
+    x = replicate_pad(x, margin)
+    if radius == 0:
         return x
     both: Any = (sigma, sigma)
     if isinstance(sigma, Tensor):
         both = sigma.to(x.dtype).clamp(min=MIN_TENSOR_SIGMA).expand(1, 2)
     with full_precision(x), _without_tf32(x):
-        blurred: Tensor = gaussian_blur2d(x, 2 * width + 1, both, "replicate")
-    H, W = (side - 2 * beyond for side in x.shape[-2:])
-    return blurred[..., beyond : beyond + H, beyond : beyond + W]
+        blurred: Tensor = gaussian_blur2d(x, 2 * radius + 1, both, "replicate")
+    return blurred
 
 
 def prefers_shifts() -> bool:
@@ -305,12 +303,19 @@ def prefers_shifts() -> bool:
 
 def _weighted_shifts(x: Tensor, weights: Sequence[float] | Tensor) -> Tensor:
     """The separable correlation of ``x`` with ``weights``, where it lies in ``x``."""
+    if len(weights) == 1:
+        return x
     for dim in (-1, -2):
         padded = x
         length = x.shape[dim] - len(weights) + 1
         x = padded.narrow(dim, 0, length) * weights[0]
         for i in range(1, len(weights)):
-            x = x + padded.narrow(dim, i, length) * weights[i]
+            part = padded.narrow(dim, i, length)
+            x = (
+                x.addcmul_(part, weights[i])
+                if isinstance(weights, Tensor)
+                else x.add_(part, alpha=weights[i])
+            )
     return x
 
 
@@ -365,30 +370,22 @@ def central_gradient(p: Tensor) -> tuple[Tensor, Tensor]:
         return _half_difference(p[..., 1:-1, 2:], p[..., 1:-1, :-2]), _half_difference(
             p[..., 2:, 1:-1], p[..., :-2, 1:-1]
         )
-    x, y = _differences(p, order=1)
+    from kornia.filters import spatial_gradient  # here, because its import takes 0.3 s
+
+    with full_precision(p), _without_tf32(p):
+        found: Tensor = spatial_gradient(p, "diff", 1)
+    x, y = found[..., 1:-1, 1:-1].unbind(2)  # the border has replicated neighbours
     return x, y
 
 
 def central_derivatives(p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """(p_x, p_y, p_xx, p_yy, p_xy) per px and px^2; each is 1 px smaller than p on each side."""
-    if not prefers_shifts():
-        xx, xy, yy = _differences(p, order=2)
-        return *central_gradient(p), xx, yy, xy
     x = p[..., 1:-1, 1:-1]
     slope = _half_difference(p[..., 2:], p[..., :-2])
     xx = (p[..., 1:-1, 2:] + p[..., 1:-1, :-2]).sub_(x, alpha=2)
     yy = (p[..., 2:, 1:-1] + p[..., :-2, 1:-1]).sub_(x, alpha=2)
     xy = _half_difference(slope[..., 2:, :], slope[..., :-2, :])
     return slope[..., 1:-1, :], _half_difference(p[..., 2:, 1:-1], p[..., :-2, 1:-1]), xx, yy, xy
-
-
-def _differences(p: Tensor, *, order: int) -> tuple[Tensor, ...]:
-    """kornia's derivatives of one order, without the border that has a replicated neighbour."""
-    from kornia.filters import spatial_gradient  # here, because its import takes 0.3 s
-
-    with full_precision(p), _without_tf32(p):
-        found: Tensor = spatial_gradient(p, "diff", order)
-    return found[..., 1:-1, 1:-1].unbind(2)
 
 
 def _half_difference(after: Tensor, before: Tensor) -> Tensor:

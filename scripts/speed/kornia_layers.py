@@ -1,6 +1,6 @@
 """Compare whole layers and commands by kornia's filters with the same by sums of shifted images.
 
-    python scripts/speed/kornia_layers.py                      # eager: layers, a bank, a photograph
+    python scripts/speed/kornia_layers.py                      # eager: layers, a new photograph
     python scripts/speed/kornia_layers.py --compiled           # layers in graphs of torch.compile
 
 Writes scripts/results/kornia_layers.json and the tables of docs/kornia.md after each measurement;
@@ -14,7 +14,6 @@ import functools
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,36 +29,20 @@ from scripts.speed.timing import backward, forward, least_times
 
 BATCH = 8
 SIZE = 256
-LIMITS = {"eager": 2.5, "compiled": 1.5, "bank": 1.15, "photograph": 1.05}
+LIMITS = {"eager": 2.5, "compiled": 1.5, "photograph": 1.05}
 """Of kornia's time to that of shifted images, up to which kornia's function is used."""
 
 OUT = _shared.RESULTS / "kornia_layers.json"
 PAGE = _shared.REPOSITORY / "docs" / "kornia.md"
-PRIMITIVES = ("smooth", "central_gradient", "central_derivatives")
-SHORT = {"smooth": "Gaussian", "central_gradient": "first", "central_derivatives": "second"}
-
-
-@dataclass(frozen=True)
-class Layer:
-    """A layer, and which of :data:`PRIMITIVES` it consists of."""
-
-    module: nn.Module
-    parts: tuple[str, ...]
-    of_depth: bool = False
-
-
-LAYERS: dict[str, Layer] = {
-    "ImageGradient": Layer(cr.ImageGradient(), PRIMITIVES[:2]),
-    "ImageCurvilinearSaliency": Layer(cr.ImageCurvilinearSaliency(), PRIMITIVES[:2]),
-    "MultiScaleFocusCurves": Layer(cr.MultiScaleFocusCurves(), PRIMITIVES[:2]),
-    "MultiScaleCurvilinearSaliency": Layer(cr.MultiScaleCurvilinearSaliency(), PRIMITIVES[:2]),
-    "EdgeBlur": Layer(cr.filters.EdgeBlur(), PRIMITIVES[:2]),
-    "PrincipalCurvatureImage": Layer(cr.filters.PrincipalCurvatureImage(), PRIMITIVES),
-    "DepthCurvilinearSaliency": Layer(cr.DepthCurvilinearSaliency(), PRIMITIVES, of_depth=True),
-    "AverageShadingGradient": Layer(cr.AverageShadingGradient(), PRIMITIVES, of_depth=True),
-    "HessianFrobeniusNorm": Layer(cr.HessianFrobeniusNorm(), PRIMITIVES, of_depth=True),
-    "ApparentRidges": Layer(cr.ApparentRidges(), PRIMITIVES, of_depth=True),
+LAYERS: dict[str, nn.Module] = {
+    "ImageGradient": cr.ImageGradient(),
+    "ImageCurvilinearSaliency": cr.ImageCurvilinearSaliency(),
+    "MultiScaleFocusCurves": cr.MultiScaleFocusCurves(),
+    "MultiScaleCurvilinearSaliency": cr.MultiScaleCurvilinearSaliency(),
+    "EdgeBlur": cr.filters.EdgeBlur(),
+    "PrincipalCurvatureImage": cr.filters.PrincipalCurvatureImage(),
 }
+"""Those of photographs; of depth, nothing is kornia's."""
 
 
 def _yes() -> bool:
@@ -105,19 +88,18 @@ def paired(calls: list[Callable[[], object]], rounds: int, seconds: float) -> di
     }
 
 
-def image_of(layer: Layer, size: int) -> Tensor:
+def image_of(size: int) -> Tensor:
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(BATCH, 1, size, size, generator=generator)
-    smooth = cr.filters.gaussian_smooth(image, 2.0)
-    return 1.0 + smooth if layer.of_depth else smooth
+    return cr.filters.gaussian_smooth(image, 2.0)
 
 
 def measure_layer(
-    layer: Layer, size: int, *, compiled: bool, rounds: int, seconds: float
+    layer: nn.Module, size: int, *, compiled: bool, rounds: int, seconds: float
 ) -> dict[str, Any]:
-    image = image_of(layer, size)
+    image = image_of(size)
     torch._dynamo.reset()
-    module = torch.compile(layer.module, fullgraph=True) if compiled else layer.module
+    module = torch.compile(layer, fullgraph=True) if compiled else layer
     functions = [functools.partial(chosen, module, by_kornia) for by_kornia in (False, True)]
     found = [forward(function, image) for function in functions]
     entry: dict[str, Any] = {"difference": difference(found[1], found[0])}
@@ -128,19 +110,6 @@ def measure_layer(
         calls = [functools.partial(run, function, x) for function in functions]
         entry[name] = paired(calls, rounds, seconds)
     return entry
-
-
-def measure_bank(rounds: int) -> dict[str, Any]:
-    """A bank of 288 views of the demo's mesh, as `curvireg register` builds it."""
-    scene = cr.synthetic.demo_scene()
-    pipeline = cr.Pipeline().with_pose_prior("upright")
-    build = functools.partial(cr.ViewBank.build, scene.mesh, pipeline=pipeline, progress=False)
-    calls = [functools.partial(chosen, build, by_kornia) for by_kornia in (False, True)]
-    banks = [call() for call in calls]
-    return {
-        "difference": difference(banks[1].descriptors, banks[0].descriptors),
-        "bank": paired(calls, rounds, 0.0),
-    }
 
 
 def measure_photograph(preset: str, rounds: int) -> dict[str, Any]:
@@ -158,8 +127,8 @@ def measure_photograph(preset: str, rounds: int) -> dict[str, Any]:
 
 def table(record: dict[str, Any]) -> list[str]:
     """Lines of the tables: layers, then commands."""
-    rows = [["layer", "by kornia", "forward", "both", "compiled, forward", "both", "difference"]]
-    for name, layer in LAYERS.items():
+    rows = [["layer", "forward", "both", "compiled, forward", "both", "difference"]]
+    for name in LAYERS:
         eager = record["eager"].get(name, {})
         graph = record["compiled"].get(name, {})
         ratios = [
@@ -168,10 +137,12 @@ def table(record: dict[str, Any]) -> list[str]:
             for run in ("forward", "both")
         ]
         shown = f"{eager['difference']:.0e}" if eager else "-"
-        rows.append([name, ", ".join(SHORT[part] for part in layer.parts), *ratios, shown])
+        rows.append([name, *ratios, shown])
+    if not record["commands"]:
+        return _shared.table_lines(rows)
     commands = [["command", "shifted images", "kornia", "ratio"]]
     for name, entry in record["commands"].items():
-        times = entry.get("bank") or entry["photograph"]
+        times = entry["photograph"]
         seconds = (f"{times[f'{kind}_ms'] / 1e3:.2f} s" for kind in ("shifts", "kornia"))
         commands.append([name, *seconds, f"{times['ratio']:.2f}"])
     return [*_shared.table_lines(rows), "", *_shared.table_lines(commands)]
@@ -204,7 +175,6 @@ def main() -> None:
         for name, layer in LAYERS.items()
     }
     if not options.compiled:
-        measures["bank of 288 views"] = ("commands", lambda: measure_bank(options.rounds))
         for preset in ("learned", "classical"):
             measures[f"new photograph, `{preset}`"] = (
                 "commands",

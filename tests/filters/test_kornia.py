@@ -19,20 +19,13 @@ def smoothed(sigma: float | Tensor, **options: object) -> Callable[[Tensor], Ten
     return lambda x: ops.smooth(x, sigma, **options)
 
 
-def derivatives(x: Tensor) -> Tensor:
-    return torch.cat(ops.central_derivatives(x), dim=1)
-
-
 PRIMITIVES = {
     **{f"sigma {s}": smoothed(s) for s in (0.0, 0.3, 1.0, 2.5, 6.0)},
     "no margin": smoothed(1.3, margin=0),
-    "linear": smoothed(1.3, linear=True),
-    "linear, no margin": smoothed(2.0, margin=0, linear=True),
     "tensor": smoothed(torch.tensor(1.7, dtype=torch.float64)),
-    "large tensor": smoothed(torch.tensor(6.0, dtype=torch.float64), linear=True),
+    "large tensor": smoothed(torch.tensor(6.0, dtype=torch.float64)),
     "tensor of zero": smoothed(torch.tensor(0.0, dtype=torch.float64)),
     "first": lambda x: torch.cat(ops.central_gradient(x), dim=1),
-    "derivatives": derivatives,
 }
 
 
@@ -57,11 +50,11 @@ def test_both_give_the_same_with_the_same_derivatives(
 
 @pytest.mark.parametrize("name", list(LAYERS))
 def test_layers_are_the_same_by_both(name: str) -> None:
-    image = image_of(LAYERS[name], 48)
+    image = image_of(48)
     fields = []
     for by_kornia in (False, True):
         with computed(by_kornia=by_kornia):
-            fields.append(LAYERS[name].module(image))
+            fields.append(LAYERS[name](image))
     if name == "EdgeBlur":  # that of no edge is any number
         fields = [field.reciprocal() for field in fields]
     off = torch.minimum((fields[0] - fields[1]).abs(), (fields[0] + fields[1]).abs())
@@ -83,9 +76,9 @@ def test_filters_call_kornia_and_graphs_do_not(monkeypatch: pytest.MonkeyPatch) 
     x = torch.rand(1, 1, 16, 16)
     field = filters.image_gradient(x)
     assert calls == ["gaussian_blur2d", "spatial_gradient"]
-    filters.depth_curvilinear_saliency(1 + x)
-    assert calls[2:] == ["gaussian_blur2d", "spatial_gradient", "spatial_gradient"]
     calls.clear()
+    filters.depth_curvilinear_saliency(1 + x)  # where rounding decides between directions
+    assert not calls
     torch._dynamo.reset()
     graph = torch.compile(filters.image_gradient, fullgraph=True, backend="eager")
     torch.testing.assert_close(graph(x), field)
@@ -110,8 +103,7 @@ def test_the_page_shows_the_record_which_is_within_the_limits() -> None:
     for entry in record["eager"].values():
         assert entry["forward"]["ratio"] <= LIMITS["eager"]
     for entry in record["commands"].values():
-        for kind in {"bank", "photograph"} & set(entry):
-            assert entry[kind]["ratio"] <= LIMITS[kind]
+        assert entry["photograph"]["ratio"] <= LIMITS["photograph"]
 
 
 def test_measurements_run_and_those_not_repeated_stay(
@@ -119,13 +111,13 @@ def test_measurements_run_and_those_not_repeated_stay(
 ) -> None:
     out = tmp_path / "record.json"
     words = ["script", "--rounds", "1", "--seconds", "0.0001", "--size", "32", "--out", str(out)]
-    for name in ("HessianFrobeniusNorm", "ImageGradient"):
+    for name in ("ImageCurvilinearSaliency", "ImageGradient"):
         monkeypatch.setattr("sys.argv", [*words, "--only", name])
         script.main()
     record = json.loads(out.read_text())
-    assert set(record["eager"]) == {"HessianFrobeniusNorm", "ImageGradient"}
+    assert set(record["eager"]) == {"ImageCurvilinearSaliency", "ImageGradient"}
     for entry in record["eager"].values():
         assert entry["difference"] < 1e-5
         assert entry["forward"]["ratio"] > 0
     assert ops.prefers_shifts() is False
-    assert "| ImageGradient | Gaussian, first |" in "\n".join(table(record))
+    assert "| ImageGradient | " in "\n".join(table(record))

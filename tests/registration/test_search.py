@@ -100,7 +100,7 @@ class TwoPeaks(Peak):
 
 
 class Scattered(Peak):
-    """The best view has no neighbour among the best three: 100 and 180 degrees of azimuth follow."""
+    """The best view has no neighbour among the best three: azimuths of 100 and 180 follow it."""
 
     def scores(self, views: Any) -> Tensor:
         far = ((views.azimuth - 140.0).abs().round() == 40.0) & (views.elevation.abs() < 1.0)
