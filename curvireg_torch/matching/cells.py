@@ -66,8 +66,10 @@ def distinct_views(
         >>> distinct_views(torch.tensor([1, 0, 2]), R, count=2).tolist()
         [1, 2]
     """
-    symmetries = torch.eye(3)[None] if symmetries is None else symmetries
-    check_symmetries(symmetries)
+    if symmetries is None:
+        symmetries = torch.eye(3)[None]
+    else:
+        check_symmetries(symmetries)
     R, S = (
         x.detach().cpu().float().numpy() for x in (rotations, symmetries[:, :3, :3].to(rotations))
     )  # many small steps

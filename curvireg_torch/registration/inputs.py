@@ -72,9 +72,7 @@ class ImageItem:
     what is questionable about them; ``focal_deviation`` and ``camera_source`` as in
     :class:`Camera`.
 
-    Raises:
-        InvalidInputError: something else, an empty box or one outside the image, skew, or pixels
-            that are not square.
+    What strangers give is checked by :func:`image_item`, once.
     """
 
     image: Tensor
@@ -85,13 +83,6 @@ class ImageItem:
     notes: tuple[str, ...] = ()
     focal_deviation: float = 0.0
     camera_source: str = "given"
-
-    def __post_init__(self) -> None:
-        check_photograph(self.image, "photograph")
-        check_boxes(self.box[None], [self.size])
-        if self.camera_matrix is not None:
-            check_camera_matrix(self.camera_matrix)
-            check_square_pixels(self.camera_matrix)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -350,6 +341,10 @@ def image_item(
         around = torch.stack([x.min() - 0.5, y.min() - 0.5, x.max() + 0.5, y.max() + 0.5])
         box = around if box is None else box
     box = whole_image_box(pixels).cpu() if box is None else box
+    check_boxes(box[None], [(int(pixels.shape[-2]), int(pixels.shape[-1]))])
+    if camera is not None:
+        check_camera_matrix(camera)
+        check_square_pixels(camera)
     item = ImageItem(pixels, box, camera, prior, mask)
     # Of an object that the border cuts, only the visible part is known.
     item = replace(item, box=clipped(box, item.size))
