@@ -124,6 +124,8 @@ def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) 
     # In units of the photograph's longer side: OpenCV computes in single precision.
     scale = 1.0 / max(size)
     outline = cv2.convexHull((scale * pixels).astype(np.float32))
+    if (pixels >= (x0, y0)).all() and (pixels <= (x1, y1)).all():
+        return 0.0  # not what rounding leaves of the areas' difference
     frame = scale * np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     whole = cv2.contourArea(outline)
     if whole <= 0.0:

@@ -255,8 +255,8 @@ class _Views:
         second = vertices.index_select(0, end.index_select(0, number)).view(N, count, 3)
         at = torch.lerp(first, second, fraction[..., None])
         # across the edge, to the side on which its faces are not
-        turn = torch.where(self.side.gather(1, chosen), -1j, 1j)
         unit = along / span.clamp(min=1e-30)
+        turn = torch.where(self.side.gather(1, chosen), -1j, 1j).to(unit.dtype)
         normal = torch.view_as_real(turn * unit.index_select(0, number).view(N, count))
         return _Places(chosen, fraction, at, normal, valid)
 
@@ -333,7 +333,7 @@ def _spread_evenly(
     passed[-1] = count * poses
     places = torch.diff(passed, prepend=passed.new_zeros(1))
     number = torch.repeat_interleave(places, output_size=count * poses)
-    place = (torch.arange(count, device=pose.device) + 0.5) / count
+    place = (torch.arange(count, dtype=torch.float32, device=pose.device) + 0.5) / count
     target = before[:-1, None] + place * total[:, None]
     behind = end.index_select(0, number).view(poses, count) - target
     length_there = length.index_select(0, number).view(poses, count)

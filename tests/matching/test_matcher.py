@@ -173,17 +173,20 @@ def test_the_best_view_outside_the_limits_is_more_than_30_degrees_away(bank, mat
 def test_appearance_is_compared_with_the_views_that_were_compared(small_bank):
     """Views without a raw score are no views of score 0."""
     matcher = ViewMatcher(small_bank)
-    compared = torch.tensor([0.20, 0.30])
+    first = torch.tensor([0.20, 0.30])
+    second = torch.tensor([0.10, 0.40])
     appearance = Mock(term=matcher._appearance.term)
-    appearance.compare.return_value = torch.tensor([[0.35, 0.25]])
+    appearance.compare.return_value = torch.tensor([[0.35, 0.9, 0.25], [0.8, 0.45, 0.7]])
     matcher.__dict__["_modules"]["_appearance"] = appearance
-    pictures = torch.zeros(2, 1, 8, 8)
-    for raw in (compared, torch.tensor([torch.nan, 0.20, torch.nan, torch.nan, 0.30])):
-        ranking = SimpleNamespace(terms={Appearance.name: raw[None]})
-        scores = matcher.appearance_score(SimpleNamespace(), ranking, pictures)
-        for score, mine in zip(scores.tolist(), (0.35, 0.25), strict=True):
+    features = torch.zeros(3, 4)
+    photograph = torch.tensor([0, 1, 0])
+    poses = ((first, 0.35), (second, 0.45), (first, 0.25))
+    for raw in (first, torch.tensor([torch.nan, 0.20, torch.nan, torch.nan, 0.30])):
+        rankings = [SimpleNamespace(terms={Appearance.name: one[None]}) for one in (raw, second)]
+        scores = matcher.appearance_scores(SimpleNamespace(), rankings, features, photograph)
+        for score, (compared, mine) in zip(scores.tolist(), poses, strict=True):
             values = torch.cat([compared.double(), torch.tensor([mine], dtype=torch.float64)])
-            expected = (mine - 0.30) / float(values.std(correction=0))
+            expected = (mine - float(compared.max())) / float(values.std(correction=0))
             assert score == pytest.approx(expected, rel=1e-5)
 
 
