@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 # photographs of a list that could not be registered, of which the command prints the reason
 MAX_FAILURES = 10
+# By what ``--need`` names, the verdicts that are enough for ``--strict``
+ENOUGH = {"pose": ("reliable",), "axis": ("reliable", "reliable axis")}
 # exit codes of ``--strict``
 NONE_RELIABLE = 3
 SOME_FAILED = 4
@@ -132,6 +134,11 @@ def add_register(commands: Any) -> None:
         f"photographs failed"
     )
     add("--strict", action="store_true", help=strict)
+    need = (
+        "with --strict: what must be reliable, the whole pose or, of nearly round objects, at "
+        "least the axis (default: pose)"
+    )
+    add("--need", choices=tuple(ENOUGH), help=need)
     formats = (
         "ros: also write DIR/pose.yaml, a PoseStamped, DIR/tf.yaml, and, of reliable poses, "
         "DIR/pose_with_covariance.yaml, in metres; m3t, visp: a start pose and the mesh for these "
@@ -210,6 +217,8 @@ def complete(arguments: argparse.Namespace) -> str | None:
     for name in ("stamp", "frame"):
         if getattr(arguments, name) is not None and arguments.format != "ros":
             return f"--{name}: of the messages of --format ros; give it too"
+    if arguments.need and not arguments.strict:
+        return "--need says what --strict asks for; give it too"
     if arguments.format and (arguments.list or arguments.out is None):
         return f"--format {arguments.format}: of one result, in --out DIR"
     if arguments.format in TRACKERS and rig is not None:
@@ -250,7 +259,15 @@ def run(arguments: argparse.Namespace) -> int:
     if not counts.posed:
         message = "no photograph could be registered; the message of each gives the reason"
         raise InvalidInputError(message, subject=arguments.list or "")
-    return _strict_code(counts.reliable, len(counts.failures)) if arguments.strict else 0
+    if not arguments.strict:
+        return 0
+    enough = sum(counts.verdicts.get(verdict, 0) for verdict in _enough(arguments))
+    return _strict_code(enough, len(counts.failures))
+
+
+def _enough(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """The verdicts that are enough for ``--strict``."""
+    return ENOUGH[arguments.need or "pose"]
 
 
 def _checked_options(arguments: argparse.Namespace) -> "RegisterOptions":
@@ -359,7 +376,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     if remarks:  # with --json, standard output holds only the result
         print(f"{path}: {'; '.join(remarks)}", file=sys.stderr if arguments.json else sys.stdout)
     _finish(arguments, found.document)
-    return found.reliable
+    return found.document["verdict"] in _enough(arguments)
 
 
 def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
@@ -384,7 +401,7 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
         for view in document["photographs"]:
             print(f"{view['name']}: {view_in_words(view)}")
     _finish(arguments, document)
-    return result.reliable
+    return result.verdict in _enough(arguments)
 
 
 def _write_pose(
@@ -545,6 +562,11 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
     from ..registration.words import two_decimals
 
     if document["ambiguous"] is None:
+        return
+    if document["ambiguous"].startswith("mesh"):
+        every = enumerate(document["mesh_probabilities"])
+        of_meshes = ", ".join(f"mesh {k}: {two_decimals(p)}" for k, p in every)
+        print(f"several meshes fit: {of_meshes}; a photograph of where they differ decides")
         return
     poses = zip(document["hypotheses"], document["probabilities"], strict=False)
     rivals = list(poses)[1:]

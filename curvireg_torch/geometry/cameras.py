@@ -155,6 +155,19 @@ def rotation_towards(rays: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
+def turn_with_ray(position: Tensor) -> Tensor:
+    """(3, 3) derivative of :func:`rotation_towards` by the position (3,), as rotation vectors: that
+    of the rotation between two near positions is the matrix times their difference."""
+    distance = torch.linalg.vector_norm(position)
+    ray = position / distance
+    x, y, z = ray.unbind()
+    zero = torch.zeros_like(x)
+    rows = [zero, -z, y], [z, zero, -x], [-y, x, zero]
+    across = torch.stack([torch.stack(row) for row in rows])  # ray x difference
+    roll = torch.stack([y, -x, zero]) / (1.0 + z)
+    return (across + torch.outer(ray, roll)) / distance
+
+
 def pose_from_box(
     points: Tensor, rotation: Tensor, box: Tensor, K: Tensor
 ) -> tuple[Tensor, Tensor]:

@@ -44,7 +44,7 @@ POSE_COLUMNS = (
 )
 """Columns of a pose: the rotation row by row, and the translation."""
 
-RESULT_COLUMNS = ("verdict", "message", "confidence", "reliable", *POSE_COLUMNS)
+RESULT_COLUMNS = ("verdict", "message", "confidence", "reliable", *POSE_COLUMNS, "exactness")
 """Columns of ``results.csv`` after those of the list."""
 
 BEST_MESH = "found_mesh"  # a last column, if rows have several meshes: the best of them
@@ -360,7 +360,7 @@ def _instance_cells(number: int, row: Row) -> list[str]:
 
 def _result_cells(row: Row) -> list[str]:
     if not has_pose(row):
-        return [row["verdict"], row["message"], "", "false", *[""] * 12]
+        return [row["verdict"], row["message"], "", "false", *[""] * 13]
     confidence = "" if row["confidence"] is None else str(row["confidence"])
     pose = [*(v for line in row["rotation"] for v in line), *(row["translation"] or [""] * 3)]
     return [
@@ -369,4 +369,5 @@ def _result_cells(row: Row) -> list[str]:
         confidence,
         "true" if row["reliable"] else "false",
         *map(str, pose),
+        exactness["words"] if (exactness := row.get("exactness")) else "",
     ]

@@ -284,7 +284,6 @@ def _with_proposals(found: list[Found], proposals: Proposals) -> list[Registrati
     kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), SAME_OBJECT_OVERLAP)
     results = []
     for one in found:
-        probabilities = tuple(p * one.score for p in one.registration.probabilities)
         detection = Detection(one.box, one.score, one.response, boxes[kept], responses[kept])
-        results.append(replace(one.registration, detection=detection, probabilities=probabilities))
+        results.append(replace(one.registration.scaled(one.score), detection=detection))
     return results

@@ -70,6 +70,7 @@ def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
             "verdict": result.verdict,
             "confidence": result.confidence,
             "reliable": result.reliable,
+            "axis": result.axis and result.axis.to_dict(),
             "warnings": [*result.warnings, *result.notes],
             **result.hypotheses[0].pose_dict(),
         }

@@ -24,7 +24,7 @@ from ..fitting.focal_length import (
     scaled_cameras,
 )
 from ..fitting.measured_fit import FULL_SIZE_RADII, ContourFit, measured_fit
-from ..geometry.cameras import camera_matrix
+from ..geometry.cameras import camera_matrix, point_in_cameras, turn_with_ray
 from ..geometry.conversions import cross_matrix
 from ..matching import ViewDescriber
 from .hypotheses import Hypotheses, placed
@@ -45,6 +45,10 @@ full size."""
 REPORTED_VARIANCE = 0.6
 """Share that is reported of the variance with which focal lengths are fitted: on 45 photographs of
 four sets with cameras, errors were 0.6 of the deviations of the whole (root mean square)."""
+
+PRINCIPAL_DEVIATION = 0.2
+"""Standard deviation of the principal point of an unknown camera, as a fraction of the photograph's
+longer side: the photograph may have been cropped, which perspective hardly shows."""
 
 HALF_RADII = (6.0, 4.0, 3.0)
 FULL_RADII = FULL_SIZE_RADII
@@ -143,3 +147,19 @@ def focal_covariance(
     motion = torch.cat([turn, shift], dim=1)
     covariance = pose.covariance + variance[:, None, None] * motion[:, :, None] * motion[:, None]
     return covariance, float(variance.sqrt())
+
+
+def principal_covariance(pose: Hypotheses, size: tuple[int, int], centre: Tensor) -> Tensor:
+    """(1, 6, 6) what the error of the principal point of an unknown camera adds to the covariance
+    of one pose, in a photograph of ``size`` (H, W): the object moves across the optical axis and
+    turns with the ray through its ``centre`` (3,), so that it looks the same."""
+    position = point_in_cameras(pose.T, centre)
+    pixels = PRINCIPAL_DEVIATION * max(size)
+    across = torch.eye(3, dtype=torch.float64)[:2]
+    shift = across * (pixels * position[0, 2] / pose.cameras[0, 0, 0])  # one row for each of x, y
+    turn = shift @ turn_with_ray(position[0]).mT
+    arm = (pose.T[0, :3, :3] @ centre).expand(2, 3)
+    # from the translation of the centre to that of the origin, as in pose_covariance
+    shift = shift + torch.linalg.cross(arm, turn)
+    motion = torch.cat([turn, shift], dim=1)
+    return (motion.mT @ motion)[None]

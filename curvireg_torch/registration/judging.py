@@ -1,6 +1,7 @@
 """Judgement of the fitted poses of one photograph: their order, their probabilities, and what is
 questionable."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
@@ -18,9 +19,10 @@ from .confidence import (
     undetermined_axes,
 )
 from .framing import border_sides, outside_fraction, outside_warnings
+from .groups import Axis, Rivals, axis_of, pair_probability
 from .hypotheses import Hypotheses, hypothesis_of
 from .inputs import ImageItem
-from .result import FailedRegistration, Registration
+from .result import Registration, ambiguity
 from .target import Target
 
 OUTSIDE_MARGIN = 1.0
@@ -81,10 +83,14 @@ def judged(
         share = measured["ranking_share"] or 1.0
         measured = {**measured, "margin": max(-gain, 0.0), "ranking_share": share}
     probabilities: tuple[float, ...] = ()
+    axis = None
+    of_pair = None
     if is_calibrated(target.pipeline):
         any_right = probability_of_any(measured, exact=block.exact)
         every = hypothesis_probabilities(any_right, scores[rivals], exact=block.exact)
         probabilities = (*every, *[0.0] * (len(own) - len(rivals)))[: len(reported)]
+        if block.exact:
+            axis, of_pair = _of_groups(target, block, photograph, poses[rivals], measured)
     with_camera = item.camera_matrix is not None
     hypotheses = [
         hypothesis_of(poses, h, evidence.named(h), with_camera=with_camera) for h in reported
@@ -99,8 +105,39 @@ def judged(
         warnings=item.warnings + target.mesh_warnings + outside_warnings(fraction),
         notes=target.mesh_notes,
         camera=item.camera,
+        axis=axis,
+        pair_probability=of_pair,
         reliable_from=target.pipeline.fit.reliable,
     )
+
+
+def _of_groups(
+    target: Target,
+    block: Block,
+    photograph: int,
+    rivals: Hypotheses,
+    measured: Mapping[str, float | None],
+) -> tuple[Axis | None, float | None]:
+    """Where the axis of a nearly round object points, and the probability that one of two poses is
+    right that are each other's half turn or mirror image; each None where there is none."""
+    weights = target.score_weights(exact=True)
+    compared = Rivals(
+        rivals.rotation,
+        rivals.evidence.scores(weights),
+        rivals.evidence.scores(replace(weights, keypoints=0.0)),
+        measured,
+        target.bank.views.rotations,
+        block.rankings[photograph].scores[0],
+    )
+    round_axis = target.round_axis
+    axis = None
+    if round_axis is not None:
+        has_camera = block.photographs[photograph].camera_matrix is not None
+        rotation = rivals.T[0, :3, :3] if has_camera else rivals.rotation[0]
+        axis = axis_of(compared, round_axis, rotation)
+    if ambiguity(rivals.rotation[:2]) not in ("half turn", "mirror"):
+        return axis, None
+    return axis, pair_probability(compared, block.symmetries)
 
 
 def _near_best(block: Block, poses: Hypotheses) -> Tensor:
@@ -142,18 +179,3 @@ def _contradiction(
     filling = Hypotheses.in_boxes(target.describer, boxes, cameras, *placement)
     better = gain is not None and gain > OUTSIDE_MARGIN
     return limits.contradiction(best, filling, better_outside=better)
-
-
-def better_of(
-    one: Registration | FailedRegistration,
-    rival: Registration | FailedRegistration,
-    mesh_index: int,
-) -> Registration | FailedRegistration:
-    """The registration with more confidence, or with a higher score where there is none;
-    ``mesh_index`` is the rival's."""
-    if not isinstance(rival, Registration):
-        return one
-    if not isinstance(one, Registration):
-        return replace(rival, mesh_index=mesh_index)
-    ahead = (rival.confidence or 0.0, rival.score) > (one.confidence or 0.0, one.score)
-    return replace(rival, mesh_index=mesh_index) if ahead else one

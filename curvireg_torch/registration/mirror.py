@@ -52,10 +52,8 @@ def compared_with_mirror_image(
         return found
     gain = mirror_gain(target, block, crops, best[compared])
     for place in compared[gain > resolution(exact=True)].tolist():
-        result = found[place]
-        probabilities = tuple(DOUBT * probability for probability in result.probabilities)
-        warnings = (*result.warnings, WARNING)
-        found[place] = replace(result, probabilities=probabilities, warnings=warnings)
+        doubted = found[place].scaled(DOUBT)
+        found[place] = replace(doubted, warnings=(*doubted.warnings, WARNING))
     return found
 
 

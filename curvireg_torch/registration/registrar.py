@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -22,9 +21,9 @@ from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike
 from ..utils.precision import in_full_precision
 from .detection import detect_item
 from .inputs import ImageItem, image_items
-from .judging import better_of
 from .refinement import refine
 from .result import FailedRegistration, Registration
+from .rival_meshes import best_of_meshes
 from .several import register_views
 from .stages import map_items, register_photographs
 from .target import Target
@@ -216,11 +215,11 @@ class Registrar(Target):
         if not detects:
             return register_photographs(self, items, self.others)
 
+        meshes = (self, *self.others)
+
         def detected(item: ImageItem, index: int) -> Registration | FailedRegistration:
-            best = self._detected(item, index)
-            for mesh_index, other in enumerate(self.others, 1):
-                best = better_of(best, other._detected(item, index), mesh_index)
-            return best
+            found = [mesh._detected(item, index) for mesh in meshes]
+            return best_of_meshes(found, meshes, item)
 
         found: Results = map_items(items, detected)
         return found
@@ -255,16 +254,14 @@ class Registrar(Target):
         """Register photographs of one object together, see
         :func:`curvireg_torch.registration.register_views`."""
         given = images, boxes, camera_matrices, T_cam_from_world
-        result: Registration | FailedRegistration
-        try:
-            result = register_views(self, *given)
-        except CurviregError as error:
-            if not self.others:
-                raise
-            result = FailedRegistration(error)
-        for mesh_index, other in enumerate(self.others, 1):
-            with suppress(CurviregError):  # that of the first mesh is raised if all fail
-                result = better_of(result, other.register_views(*given), mesh_index)
+        meshes = (self, *self.others)
+        found: Results = []
+        for mesh in meshes:
+            try:
+                found.append(register_views(mesh, *given))
+            except CurviregError as error:
+                found.append(FailedRegistration(error))
+        result = best_of_meshes(found, meshes)
         if isinstance(result, FailedRegistration):
             raise result.error
         return result

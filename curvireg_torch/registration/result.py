@@ -3,7 +3,7 @@
 import html
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Generic, Self, TypeVar, overload
 
 import torch
@@ -18,6 +18,8 @@ from ..geometry.viewpoint import rotation_error, viewpoint_from_rotation
 from ..matching import Ranking
 from ..pipeline import FitSettings
 from .confidence import RELIABLE
+from .exactness import Exactness, exactness_of
+from .groups import Axis
 from .words import two_decimals
 
 Value = TypeVar("Value")
@@ -27,6 +29,9 @@ UNKNOWN_ROTATION = 1.0
 # Evidence of as many keypoints as a pose can begin from: they determine it, whatever its contours
 # tell
 DETERMINING_KEYPOINTS = math.log1p(FitSettings().min_keypoints - FitSettings().chance_keypoints)
+# Of :func:`.confidence.undetermined_axes`, from which the rotation is not determined of an object
+# that is not round
+MOST_UNDETERMINED = 1.0
 # Fraction of the first pose's probability from which another one makes the answer ambiguous
 RIVAL_FRACTION = 0.5
 HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn
@@ -97,6 +102,19 @@ class Hypothesis:
         rotation, translation = self.covariance.diagonal().sqrt().split(3)
         rotation = torch.where(rotation < UNKNOWN_ROTATION, torch.rad2deg(rotation), torch.inf)
         return rotation, torch.where(translation < 0.5 * self.distance, translation, torch.inf)
+
+    @property
+    def exactness(self) -> Exactness | None:
+        """How exact the pose is if it is right; None without a covariance."""
+        if self.covariance is None or self.translation is None:
+            return None
+        return exactness_of(
+            self.covariance,
+            self.rotation,
+            self.translation,
+            self.allocentric_rotation,
+            self.distance,
+        )
 
     @property
     def transform(self) -> Tensor | None:
@@ -213,6 +231,12 @@ class Registration:
             tab of a can does, and the photograph does not show it: the pose is right up to these
             turns.
         mesh_index: of several meshes, which one this is a pose of.
+        mesh_probabilities: of each of several exact meshes, that one of its poses is right; they
+            are rivals, whose poses share one probability.
+        axis: of a nearly round object, where its axis points, whatever its turn about it; None for
+            other objects, similar meshes and pipelines without calibration.
+        pair_probability: that one of the first two rivals is right, where they are each other's
+            half turn or mirror image; else None.
         camera: of the photograph without its distortion; its ``source`` tells whether it was given,
             and ``focal_deviation`` how well its focal length is known. None without a camera, and
             of several photographs.
@@ -242,6 +266,9 @@ class Registration:
     notes: tuple[str, ...] = ()
     feature_is_hidden: bool = False
     mesh_index: int = 0
+    mesh_probabilities: tuple[float, ...] = ()
+    axis: Axis | None = None
+    pair_probability: float | None = None
     camera: Camera | None = None
     views: tuple[PhotographPose, ...] = ()
     reliable_from: float = RELIABLE
@@ -268,12 +295,16 @@ class Registration:
     @property
     def no_match_probability(self) -> float | None:
         """Probability that no hypothesis is right; None for pipelines without calibration."""
-        return max(0.0, 1.0 - sum(self.probabilities)) if self.probabilities else None
+        every = self.mesh_probabilities or self.probabilities
+        return max(0.0, 1.0 - sum(every)) if self.probabilities else None
 
     @property
     def ambiguous(self) -> str | None:
         """How poses differ that are nearly as probable as the first: "half turn", "mirror" or
-        "several", as are those that only a hidden feature of the mesh tells apart; else None."""
+        "several", as are those that only a hidden feature of the mesh tells apart; "mesh 0 or 1" of
+        meshes that are; else None."""
+        if likely_meshes := self._likely_meshes:
+            return f"mesh {' or '.join(str(k) for k in likely_meshes)}"
         likely = [p >= RIVAL_FRACTION * self.probabilities[0] for p in self.probabilities]
         near = [
             h.allocentric_rotation
@@ -286,26 +317,69 @@ class Registration:
     @property
     def reliable(self) -> bool:
         """Whether the confidence is at least ``reliable_from``, without ``warnings`` or a better
-        pose outside the prior, and the contours determine at least one axis of rotation, or as many
-        keypoints agree as a pose can begin from; if False, the pose is a guess."""
+        pose outside the prior, and the contours determine the rotation, or as many keypoints agree
+        as a pose can begin from; if False, the pose is a guess."""
         best = self.hypotheses[0]
-        doubtful = self.warnings or self.prior_contradiction == "better outside"
-        if self.confidence is None or not self.confidence >= self.reliable_from or doubtful:
+        if self.confidence is None or not self.confidence >= self.reliable_from:
+            return False
+        if self.is_questioned:
             return False
         if best.translation is None or best.edge_support is None:  # nothing to determine them by
             return True
         if best.evidence.get("keypoints", 0.0) >= DETERMINING_KEYPOINTS:
             return True
         deviations = best.standard_deviations
-        return deviations is not None and bool(deviations[0].isfinite().any())
+        if deviations is None or not bool(deviations[0].isfinite().any()):
+            return False
+        # of a nearly round object, the rotation about its axis may be left to small features
+        most = MOST_UNDETERMINED + (0.0 if self.axis is None else 1.0)
+        return (self.confidence_features.get("undetermined") or 0.0) < most
+
+    @property
+    def _likely_meshes(self) -> list[int]:
+        """The numbers of this mesh and of others that are nearly as probable, if there are any."""
+        every = self.mesh_probabilities
+        if not every:
+            return []
+        least = RIVAL_FRACTION * every[self.mesh_index]
+        likely = [k for k, p in enumerate(every) if k == self.mesh_index or p >= least]
+        return likely if len(likely) > 1 else []
+
+    @property
+    def is_questioned(self) -> bool:
+        """Whether there are ``warnings``, or a better pose outside the prior."""
+        return bool(self.warnings) or self.prior_contradiction == "better outside"
+
+    @property
+    def axis_is_reliable(self) -> bool:
+        """Whether the probability of the ``axis`` is at least ``reliable_from``, and nothing is
+        questionable; the turn about it may be a guess."""
+        if self.axis is None or self.is_questioned:
+            return False
+        return self.axis.probability >= self.reliable_from
+
+    def scaled(self, factor: float) -> "Registration":
+        """The same with all probabilities times a factor in [0, 1]."""
+        pair = self.pair_probability
+        axis = self.axis
+        return replace(
+            self,
+            probabilities=tuple(factor * p for p in self.probabilities),
+            mesh_probabilities=tuple(factor * p for p in self.mesh_probabilities),
+            pair_probability=None if pair is None else factor * pair,
+            axis=None if axis is None else replace(axis, probability=factor * axis.probability),
+        )
 
     @property
     def verdict(self) -> str:
-        """How sure the answer is: "reliable"; "no match" if it is more probable that no hypothesis
-        is right than that the first one is; else "unsure". Every command, page and picture uses
-        these words, and "lost" or "failed" of a :class:`FailedRegistration`."""
+        """How sure the answer is: "reliable"; "reliable axis": the axis of a nearly round object is
+        certain, the turn about it is not; "no match" if it is more probable that no hypothesis is
+        right than that the first one is; else "unsure". Every command, page and picture uses these
+        words, and "lost" or "failed" of a :class:`FailedRegistration`."""
         if self.reliable:
             return "reliable"
+        if self.axis_is_reliable:
+            return "reliable axis"
         no_match = self.no_match_probability
         if self.confidence is None or no_match is None or no_match <= self.confidence:
             return "unsure"
@@ -359,6 +433,12 @@ class Registration:
     def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
         return self.hypotheses[0].standard_deviations if self.reliable else None
 
+    @property
+    def exactness(self) -> Exactness | None:
+        """Errors that nine in ten reliable answers stay within; the distance holds for the mesh's
+        size and the given focal length."""
+        return self.hypotheses[0].exactness if self.reliable and not self.views else None
+
     def to_dict(self) -> dict[str, Any]:
         """Pose, scores and uncertainty as JSON values, under the keys of ``result.json``
         (docs/results.md)."""
@@ -376,12 +456,17 @@ class Registration:
             "probabilities": list(self.probabilities),
             "no_match_probability": self.no_match_probability,
             "ambiguous": self.ambiguous,
+            "mesh_probabilities": list(self.mesh_probabilities),
+            "pair_probability": self.pair_probability,
+            "axis": self.axis and self.axis.to_dict(),
             "feature_is_hidden": self.feature_is_hidden,
             "confidence_features": dict(self.confidence_features),
             "edge_support": self.edge_support,
             "standard_deviations": deviations
             and {"rotation_deg": _finite(deviations[0]), "translation": _finite(deviations[1])},
             "covariance": _plain(self.covariance),
+            "exactness": self._exactness_dict(),
+            "allocentric_rotation": None if self.views else self.allocentric_rotation.tolist(),
             "corrected_box": _plain(self.corrected_box),
             "camera": self.camera and self.camera.describe(),
             "camera_source": self.camera and self.camera.source,
@@ -402,6 +487,10 @@ class Registration:
         if self.views:
             document["photographs"] = [view.to_dict() for view in self.views]
         return document
+
+    def _exactness_dict(self) -> dict[str, Any] | None:
+        exactness = self.exactness
+        return exactness and {**vars(exactness), "words": exactness.words}
 
     @property
     def _frame(self) -> str:

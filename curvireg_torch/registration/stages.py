@@ -31,11 +31,12 @@ from .hypotheses import (
     with_short_fit,
 )
 from .inputs import ImageItem, check_crop
-from .judging import better_of, judged
+from .judging import judged
 from .mirror import compared_with_mirror_image
 from .priors import Limits
 from .refits import refitted
 from .result import FailedRegistration, Registration
+from .rival_meshes import best_of_meshes
 from .search import search
 from .siblings import with_siblings
 from .target import Target
@@ -64,15 +65,14 @@ def register_photographs(
     memory."""
     size = BLOCK.get(target.bank.device.type, BLOCK_OF_DEVICE)
     results: list[Registration | FailedRegistration] = []
+    meshes = (target, *others)
     with exact_convolutions():
         for first in range(0, len(items), size):
             some = [items[k] for k in range(first, min(first + size, len(items)))]
-            best = _register_block(target, some, first)
-            for mesh_index, other in enumerate(others, 1):
-                rivals = _register_block(other, some, first)
-                pairs = zip(best, rivals, strict=True)
-                best = [better_of(one, rival, mesh_index) for one, rival in pairs]
-            results += best
+            of_meshes = [_register_block(mesh, some, first) for mesh in meshes]
+            for item, found in zip(some, zip(*of_meshes, strict=True), strict=True):
+                given = item if isinstance(item, ImageItem) else None
+                results.append(best_of_meshes(found, meshes, given))
     return results
 
 

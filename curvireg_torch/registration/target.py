@@ -16,6 +16,7 @@ from ..fitting.keypoints import KeypointMatches, Keypoints
 from ..matching import ViewDescriber, ViewMatcher
 from ..mesh import has_colours, mesh_radius, mesh_symmetries, mesh_warnings
 from ..mesh.mesh import mirrored
+from ..mesh.round_axis import RoundAxis, round_axis
 from ..terms import QueryFeatures
 from .detector import Detector
 from .framing import CropFrame, border_sides
@@ -96,6 +97,15 @@ class Target:
         if self.symmetries is not None or symmetries is None:
             return TellingSymmetries(torch.eye(4, dtype=torch.float64)[None])
         return telling_symmetries(self.bank.mesh, symmetries)
+
+    @cached_property
+    def round_axis(self) -> RoundAxis | None:
+        """The axis about which the mesh is nearly a body of revolution. Colours tell its ends
+        apart."""
+        axis = round_axis(self.bank.mesh)
+        return axis and axis._replace(
+            ends_are_alike=axis.ends_are_alike and not has_colours(self.bank.mesh)
+        )
 
     def frame_of(self, box: Tensor, size: tuple[int, int]) -> CropFrame | None:
         """The frame in which fitted poses are compared with a box (4,) at the border of a
@@ -212,7 +222,7 @@ class Target:
         :meta private:
         """
         _ = self.describer.contours, self.mesh_warnings
-        _ = self.is_exact and self.telling_symmetries
+        _ = self.is_exact and (self.telling_symmetries, self.round_axis)
 
     def report_progress(self, stage: str) -> None:
         """Call the progress callback, if there is one."""

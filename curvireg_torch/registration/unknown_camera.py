@@ -21,6 +21,7 @@ from .focal import (
     focal_covariance,
     off_axis_angle,
     possible_cameras,
+    principal_covariance,
     usual_camera,
     with_focal_length,
     zoomed,
@@ -184,6 +185,9 @@ def with_focal_deviation(
         if not item.focal_deviation:
             continue
         covariance, deviation = focal_covariance(target.describer, crops, poses[row], item)
+        if item.camera_source == "estimated":
+            centre = target.describer.centre
+            covariance = covariance + principal_covariance(poses[row], item.size, centre)
         unknown = torch.full_like(poses.covariance, torch.nan).index_copy(0, row, covariance)
         is_here = (poses.photograph == p)[:, None, None]
         poses = replace(poses, covariance=torch.where(is_here, unknown, poses.covariance))

@@ -11,7 +11,9 @@ from ..geometry.viewpoint import viewpoint_from_rotation
 from ..utils.choices import SIDE_NAMES
 
 # How sure an answer is, surest first; the last two have no pose
-VERDICTS = ("reliable", "unsure", "no match", "lost", "failed")
+VERDICTS = ("reliable", "reliable axis", "unsure", "no match", "lost", "failed")
+HOLDS_FOR = "if the mesh has the object's size and the focal length is right"
+AXIS_ALONE = "the axis is certain, the turn about it is not"
 STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from above or below
 # Deviation of an estimated focal length, as a fraction, from which it is hardly measured
 WEAK_PERSPECTIVE = 0.15
@@ -42,9 +44,25 @@ def remarks(document: Mapping[str, Any]) -> list[str]:
         lines.append("the photograph fits much better outside the pose prior; check it")
     elif contradiction is not None:
         lines.append("the pose lies at one of its limits; widen it to see whether it stays")
+    if document.get("verdict") == "reliable axis":
+        lines.append(AXIS_ALONE)
+    if exactness := document.get("exactness"):
+        lines.append(_exactness_in_words(exactness, document.get("camera_source")))
     if (count := document.get("symmetries", 1)) > 1:
         lines.append(f"the mesh looks the same in {count} orientations: the pose is one of as many")
     return lines
+
+
+def _exactness_in_words(exactness: Mapping[str, Any], camera_source: str | None) -> str:
+    """How exact a pose is; of an estimated camera, how exact the rotation is that a cropped
+    photograph does not change."""
+    if camera_source != "estimated":
+        return f"exact {exactness['words']}, {HOLDS_FOR}"
+    return (
+        f"exact to about {exactness['allocentric_deg']:.1g} degrees as seen along the ray to the "
+        f"object: use allocentric_rotation if the photograph may be cropped; in the camera "
+        f"{exactness['words']}"
+    )
 
 
 def camera_in_words(document: Mapping[str, Any]) -> list[str]:
@@ -133,13 +151,15 @@ def view_in_words(view: Mapping[str, Any]) -> str:
 
 
 def verdict_counts(verdicts: Mapping[str, int]) -> str:
-    """Numbers of photographs by verdict, in words; the counts of other words do not matter.
+    """Numbers of photographs by verdict, in words, "reliable axis" where there are any; the counts
+    of other words do not matter.
 
     Example:
         >>> verdict_counts({"reliable": 2, "failed": 1})
         '2 reliable, 0 unsure, 0 no match, 0 lost, 1 failed'
     """
-    return ", ".join(f"{verdicts.get(verdict, 0)} {verdict}" for verdict in VERDICTS)
+    named = [word for word in VERDICTS if word != "reliable axis" or verdicts.get(word)]
+    return ", ".join(f"{verdicts.get(word, 0)} {word}" for word in named)
 
 
 def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:

@@ -83,6 +83,7 @@ class Result:
                 for v in views
             )
         rest: dict[str, Any] = {"confidence_features": {}, "views": views}
+        rest |= {"axis": None, "pair_probability": None}
         return replace(found, hypotheses=hypotheses, probabilities=probabilities, **rest)
 
     def centre(self, T: Tensor) -> Tensor:

@@ -46,6 +46,8 @@ DOWNLOADS = {
 }
 VERDICTS = {
     "reliable": "Nine in ten such answers are right. Look whether the contours fit all the same.",
+    "reliable axis": "The axis is certain, the turn about it is not. Of such axes, nine in ten "
+    "are right.",
     "unsure": "It may be another of the answers below, or none. Choose the one whose contours fit.",
     "no match": "Probably it is not right: check the mesh, its unit and the box, or choose "
     "another answer.",

@@ -18,6 +18,7 @@ from .encoding import to_uint8
 OUTLINE = (0, 255, 80)
 CREASE = (255, 170, 0)
 BOX = (255, 255, 255)
+AXIS = (70, 190, 255)
 RIM = (0, 0, 0)
 RIM_OPACITY = 0.7  # of the black rim
 # Side in px of the crop in which contours are found, as in the last rounds of a fit
@@ -64,13 +65,15 @@ def draw_window(
     scale: float,
     box: Sequence[float] | None = None,
     copies: Sequence[Drawn] = (),
+    axis: Tensor | None = None,
 ) -> np.ndarray:
     """(H', W', 3) uint8 RGB: part of a (1 or 3, H, W) photograph with a mesh's contours, and a box
     in px below them.
 
     ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3); None draws no mesh.
     ``window`` is x0, y0, x1, y1 without the last column and row, and is resized by ``scale``.
-    ``copies`` are further meshes that are drawn.
+    ``copies`` are further meshes that are drawn. ``axis`` (2, 3) is the start and the end of an
+    arrow in the model's frame.
     """
     x0, y0, x1, y1 = window
     picture = to_uint8(image[:, y0:y1, x0:x1])
@@ -93,7 +96,20 @@ def draw_window(
             T, K = drawn.projection
             layer = contour_layer(drawn.describer, T, resize @ K.cpu().double(), picture.shape[:2])
             _paint(picture, layer)
+    if axis is not None and projection is not None:
+        _draw_axis(picture, axis, projection[0], resize @ projection[1].cpu().double())
     return picture
+
+
+def _draw_axis(picture: np.ndarray, ends: Tensor, T: Tensor, K: Tensor) -> None:
+    """Draw an arrow between ``ends`` (2, 3) of the model; ``K`` (3, 3) has px of the picture."""
+    depth = ends.to(T) @ T[2, :3] + T[2, 3]
+    if float(depth.min()) <= 0.0:
+        return
+    start, end = projected(ends.to(T), T, K.to(T)).round().int().tolist()
+    width = max(2, round(line_width(picture.shape[:2])))
+    for colour, thickness in ((RIM, width + 2), (AXIS, width)):
+        cv2.arrowedLine(picture, start, end, colour, thickness, cv2.LINE_AA, tipLength=0.08)
 
 
 def _draw_box(picture: np.ndarray, resize: Tensor, box: Sequence[float]) -> None:

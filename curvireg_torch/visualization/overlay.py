@@ -31,7 +31,13 @@ GAP = 10  # px between pictures
 PAPER = (255, 255, 255)
 INK = (30, 30, 30)
 FAINT = (100, 100, 100)
-VERDICT_COLOURS = {"reliable": (20, 125, 65), "unsure": (185, 105, 0), "no match": (190, 40, 40)}
+VERDICT_COLOURS = {
+    "reliable": (20, 125, 65),
+    "reliable axis": (20, 105, 125),
+    "unsure": (185, 105, 0),
+    "no match": (190, 40, 40),
+}
+AXIS_RADII = 1.3  # from the middle to the end of an axis, in radii of the object
 LEGEND = "Green: outline of the mesh at this pose. Orange: its inner edges. White: the box."
 
 
@@ -70,9 +76,23 @@ def contour_overlay(
     H, W = item.size
     describer = registrar.of_mesh(getattr(result, "mesh_index", 0)).describer
     more = drawn_copies(registrar, copies)
+    axis = axis_ends(registrar, result) if isinstance(result, Registration) else None
+    whole = (0, 0, W, H)
+    box_sides = item.box.tolist()
     return draw_window(
-        describer, result.projection, item.image, (0, 0, W, H), 1.0, item.box.tolist(), more
+        describer, result.projection, item.image, whole, 1.0, box_sides, more, axis=axis
     )
+
+
+def axis_ends(registrar: Registrar, result: Registration) -> Tensor | None:
+    """(2, 3) start and end, in the model's frame, of the arrow that shows the axis where it alone
+    is reliable; else None."""
+    target = registrar.of_mesh(result.mesh_index)
+    axis = target.round_axis
+    if axis is None or result.verdict != "reliable axis":
+        return None
+    reach = AXIS_RADII * target.describer.radius * axis.direction
+    return torch.stack([axis.point - reach, axis.point + reach])
 
 
 def drawn_copies(registrar: Registrar, copies: Sequence[Registration]) -> list[Drawn]:
@@ -200,12 +220,22 @@ def registration_sheet(
     """
     item = image_item(image, as_numbers(box, "box"))
     more = drawn_copies(registrar, copies)
+    axis = axis_ends(registrar, result)
+    if axis is not None:
+        note = f"Blue: the axis, which is certain; the turn about it is not. {note}"
     registrar = registrar.of_mesh(result.mesh_index)
     H, W = item.size
     scale = min(max(LEAST, H, W), MOST) / max(H, W)
     whole = (0, 0, W, H)
     photograph = draw_window(
-        registrar.describer, result.projection, item.image, whole, scale, item.box.tolist(), more
+        registrar.describer,
+        result.projection,
+        item.image,
+        whole,
+        scale,
+        item.box.tolist(),
+        more,
+        axis=axis,
     )
     if copies:
         note = f"{1 + len(copies)} objects; words and small pictures: the best one. {note}"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import curvireg_torch as cr
-from curvireg_torch import Camera, camera_matrix
+from curvireg_torch import Camera, Registration, camera_matrix
 from curvireg_torch.cli import main
 from curvireg_torch.cli.register import NONE_RELIABLE, SOME_FAILED
 from curvireg_torch.data import images
@@ -221,6 +221,31 @@ def test_strict_tells_by_the_exit_code_whether_a_result_is_reliable(folder, tmp_
         )
         == code
     )
+
+
+def test_strict_accepts_an_axis_where_it_is_all_that_is_needed(folder, tmp_path, monkeypatch):
+    verdicts = []
+    monkeypatch.setattr(Registration, "verdict", property(lambda _: verdicts[-1]))
+    files = [str(folder / "photos" / "0.png"), str(folder / "learned.safetensors")]
+    words = ["register", *files, "--box", *box_of(0), "--camera", *CAMERA, "--json", "--quiet"]
+    for verdict, need, code in (
+        ("reliable axis", [], NONE_RELIABLE),
+        ("reliable axis", ["--need", "pose"], NONE_RELIABLE),
+        ("reliable axis", ["--need", "axis"], 0),
+        ("reliable", ["--need", "axis"], 0),
+        ("unsure", ["--need", "axis"], NONE_RELIABLE),
+    ):
+        verdicts.append(verdict)
+        assert main([*words, "--strict", *need]) == code
+    with pytest.raises(SystemExit):  # without --strict
+        main([*words, "--need", "axis"])
+    listed = tmp_path / "list.csv"
+    listed.write_text(
+        f"photo,x0,y0,x1,y1,fx,fy,cx,cy\n{','.join([files[0], *box_of(0), *CAMERA])}\n"
+    )
+    words = ["register", "--list", str(listed), files[1], "--out", str(tmp_path / "out"), "--quiet"]
+    verdicts.append("reliable axis")
+    assert main([*words, "--strict", "--need", "axis"]) == 0
 
 
 def test_the_command_line_names_the_options_that_help(folder, capsys):

@@ -1,5 +1,6 @@
 """Focal lengths that are fitted with the pose."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -8,12 +9,13 @@ import torch
 from curvireg_torch import camera_matrix
 from curvireg_torch.fitting import focal_length
 from curvireg_torch.fitting.edges import EdgeCrops
-from curvireg_torch.geometry import rotation_error
+from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error
+from curvireg_torch.geometry.cameras import point_in_cameras, rotation_towards
 from curvireg_torch.registration import focal, unknown_camera
 from curvireg_torch.registration.hypotheses import Hypotheses, projected_box
 from curvireg_torch.registration.inputs import image_item
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from tests._support.scenes import SIZE, learned_registrar, truck_registrar
+from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 from tests.fitting.test_focal_length import NEAR, near_scene
 
 
@@ -151,3 +153,28 @@ def test_the_deviation_joins_prior_and_photograph():
     photograph = variance(1e6)
     for prior in (0.01, 0.1):
         assert 1.0 / variance(prior) == pytest.approx(1.0 / photograph + 1.0 / prior**2, rel=1e-6)
+
+
+def test_an_unknown_principal_point_moves_the_object_with_its_ray_and_keeps_its_look():
+    size = (180, 240)
+    centre = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64)
+    T = scene(0)[2][None].double()
+    none = torch.zeros(1)
+    pose = Hypotheses.at(T, CAMERA[None], centre, none.long(), none.double())
+    covariance = focal.principal_covariance(pose, size, centre)[0]
+    pixels = focal.PRINCIPAL_DEVIATION * 240
+    moved_by = torch.zeros(6, 6, dtype=torch.float64)
+    for axis in range(2):
+        step = 1e-4
+        camera = CAMERA.clone()
+        camera[axis, 2] -= step * pixels
+        position = point_in_cameras(T, centre)
+        ray = torch.linalg.inv(camera) @ (CAMERA @ position[0] / position[0, 2])
+        after = (ray * position[0, 2])[None]
+        R = rotation_towards(after) @ rotation_towards(position).mT @ T[:, :3, :3]
+        origin = after[0] - R[0] @ centre
+        turn = axis_angle_from_rotation(R[0] @ T[0, :3, :3].T)
+        motion = torch.cat([turn, origin - T[0, :3, 3]]) / step
+        moved_by += motion[:, None] * motion
+    torch.testing.assert_close(covariance, moved_by, rtol=2e-2, atol=2e-3)
+    assert 8.0 < math.degrees(float(covariance[0, 0].sqrt())) < 14.0

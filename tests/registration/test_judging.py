@@ -8,14 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from curvireg_torch.errors import LostObjectError
 from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.registration.hypotheses import Hypotheses
-from curvireg_torch.registration.judging import better_of, judged
-from curvireg_torch.registration.result import FailedRegistration, Registration
+from curvireg_torch.registration.judging import judged
+from curvireg_torch.registration.result import Registration
 from tests._support.scenes import CAMERA, SIZE
 
 HULL = 0.3 * torch.tensor(
@@ -75,6 +74,7 @@ def judgement(
         pipeline=pipeline or Pipeline(),
         bank=SimpleNamespace(views=SimpleNamespace(rotations=turned(0.0, 90.0, 180.0).float())),
         describer=SimpleNamespace(hull=HULL, centre=torch.zeros(3).double()),
+        round_axis=None,
         mesh_warnings=("of the mesh",),
         mesh_notes=("note",),
     )
@@ -197,22 +197,3 @@ def test_pipelines_without_calibration_have_no_probabilities():
     evidence = evidence_of(similarity=[0.6, 0.5])
     result = judgement(poses_at(0.0, 90.0), evidence, pipeline=PRESETS["classical"])
     assert result.probabilities == ()
-
-
-def test_the_better_of_two_meshes_is_the_more_confident_one():
-    poses = poses_at(0.0, 90.0)
-    doubtful = judgement(poses, evidence_of(similarity=[0.60, 0.60]))
-    certain = judgement(poses, evidence_of(similarity=[0.58, 0.1]))
-    assert certain.score < doubtful.score
-    assert certain.confidence > doubtful.confidence
-    assert better_of(doubtful, certain, 2).mesh_index == 2
-    assert better_of(certain, doubtful, 2) is certain
-    assert better_of(certain, certain, 2) is certain, "the first of equal ones"
-    one = replace(certain, probabilities=())
-    rival = replace(doubtful, probabilities=())
-    assert better_of(one, rival, 1).mesh_index == 1
-    assert better_of(rival, one, 1) is rival
-    failed = FailedRegistration(LostObjectError("lost"))
-    assert better_of(failed, certain, 3).mesh_index == 3
-    assert better_of(certain, failed, 3) is certain
-    assert better_of(failed, failed, 3) is failed

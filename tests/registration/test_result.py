@@ -10,6 +10,7 @@ import torch
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.registration import FailedRegistration
+from curvireg_torch.registration.groups import Axis
 from curvireg_torch.registration.result import ambiguity
 from tests._support.results import registration
 
@@ -120,3 +121,15 @@ def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_dete
     variances[0] = 1e-4
     known = tuple(replace(h, covariance=torch.diag(variances)) for h in fitted.hypotheses)
     assert replace(fitted, hypotheses=known).reliable
+
+
+def test_a_rotation_that_is_not_determined_is_not_reliable_unless_the_object_is_round():
+    sure = registration(covariance=1e-4 * torch.eye(6).double(), confidence=0.95)
+    for undetermined, is_reliable in ((0.99, True), (1.0, False)):
+        result = replace(sure, confidence_features={"undetermined": undetermined})
+        assert result.reliable == is_reliable
+        assert result.verdict == ("reliable" if is_reliable else "unsure")
+    axis = Axis(torch.eye(3)[2].double(), 0.5)
+    for undetermined, is_reliable in ((1.99, True), (2.0, False)):
+        features = {"undetermined": undetermined}
+        assert replace(sure, axis=axis, confidence_features=features).reliable == is_reliable

@@ -7,6 +7,7 @@ import torch
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import object_frame
 from curvireg_torch.registration.words import (
+    AXIS_ALONE,
     VERDICTS,
     pose_in_words,
     remarks,
@@ -54,9 +55,15 @@ def test_pose_in_words():
 
 
 def test_verdicts_are_counted_in_words():
-    assert VERDICTS[3:] == ("lost", "failed")
+    assert VERDICTS[4:] == ("lost", "failed")
     words = verdict_counts(Counter(["lost", "reliable", "reliable"]))
     assert words == "2 reliable, 0 unsure, 0 no match, 1 lost, 0 failed"
+    words = verdict_counts(Counter(["reliable axis", "unsure"]))
+    assert words == "0 reliable, 1 reliable axis, 1 unsure, 0 no match, 0 lost, 0 failed"
+
+
+def test_an_axis_that_alone_is_certain_is_said():
+    assert remarks({"corrected_box": None, "verdict": "reliable axis"}) == [AXIS_ALONE]
 
 
 def test_confidence_is_never_shown_as_more_than_it_is():

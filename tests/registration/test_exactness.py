@@ -1,0 +1,90 @@
+"""How exact a pose is, in two numbers and in words."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from curvireg_torch.calibration import CALIBRATION
+from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
+from curvireg_torch.geometry.cameras import rotation_towards
+from curvireg_torch.registration.exactness import Exactness, exactness_of
+from curvireg_torch.registration.focal import principal_covariance
+from curvireg_torch.registration.hypotheses import Hypotheses, placed
+from curvireg_torch.registration.words import remarks
+from tests._support.results import registration
+from tests._support.scenes import CAMERA
+
+COVARIANCE = torch.diag(torch.tensor([0.02, 0.05, 0.03, 1.0, 2.0, 8.0]).double().square())
+CENTRE = torch.tensor([20.0, -30.0, 10.0], dtype=torch.float64)
+
+
+def pose() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, float]:
+    """Rotation, translation, allocentric rotation and distance, in mm."""
+    R = rotation_from_viewpoint(30.0, 20.0, 5.0).double()
+    t = torch.tensor([80.0, -40.0, 600.0], dtype=torch.float64)
+    position = R @ CENTRE + t
+    return R, t, rotation_towards(position[None])[0].T @ R, float(position.norm())
+
+
+def test_nine_in_ten_errors_are_within(monkeypatch):
+    monkeypatch.setitem(CALIBRATION, "radius", {"rotation": 1.0, "distance": 1.0})
+    R, t, allocentric, distance = pose()
+    exactness = exactness_of(COVARIANCE, R, t, allocentric, distance)
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.randn(4000, 6, generator=generator, dtype=torch.float64)
+    errors = normal * COVARIANCE.diagonal().sqrt()
+    turns = rotation_from_axis_angle(errors[:, :3])
+    centres = turns @ R @ CENTRE + t + errors[:, 3:]
+    within = torch.rad2deg(errors[:, :3].norm(dim=1)) < exactness.rotation_deg
+    assert float(within.double().mean()) == pytest.approx(0.9, abs=0.02)
+    away = 100.0 * (centres.norm(dim=1) / distance - 1.0).abs()
+    within = away < exactness.distance_percent
+    assert float(within.double().mean()) == pytest.approx(0.9, abs=0.02)
+    seen = rotation_towards(centres).mT @ turns @ R
+    cosine = ((seen * allocentric).sum(dim=(1, 2)) - 1.0) / 2.0
+    within = torch.rad2deg(cosine.clamp(-1.0, 1.0).acos()) < exactness.allocentric_deg
+    assert float(within.double().mean()) == pytest.approx(0.9, abs=0.02)
+
+
+def test_a_principal_point_that_is_not_known_leaves_the_allocentric_rotation_exact():
+    R, t, allocentric, distance = pose()
+    T = torch.eye(4, dtype=torch.float64)[None]
+    T[0, :3, :3] = R
+    T[0, :3, 3] = t
+    none = torch.zeros(1)
+    poses = placed(Hypotheses.at(T, CAMERA[None], CENTRE, none.long(), none.double()), T, CENTRE)
+    unknown = principal_covariance(poses, (180, 240), CENTRE)[0]
+    exactness = exactness_of(unknown, R, t, allocentric, distance)
+    assert exactness.rotation_deg > 8.0
+    assert exactness.allocentric_deg < 0.01
+    assert exactness_of(COVARIANCE + unknown, R, t, allocentric, distance).rotation_deg > 8.0
+
+
+def test_a_turn_that_nothing_determines_is_left_out():
+    R, t, allocentric, distance = pose()
+    known = torch.diag(torch.tensor([1e-4, 1e-4, 9.0, 1.0, 1.0, 1.0]).double())
+    assert exactness_of(known, R, t, allocentric, distance).rotation_deg < 2.0
+    nothing = torch.diag(torch.tensor([9.0, 9.0, 9.0, 1.0, 1.0, 1.0]).double())
+    unknown = exactness_of(nothing, R, t, allocentric, distance)
+    assert unknown.rotation_deg == CALIBRATION["radius"]["rotation"] * 180.0
+
+
+def test_words_have_one_digit():
+    assert Exactness(2.6, 1.9, 1.0).words == "to about 3 degrees and 2 % of the distance"
+    assert Exactness(1.2, 0.34, 1.0).words == "to about 1 degree and 0.3 % of the distance"
+    assert Exactness(14.0, 0.01, 1.0).words == "to about 10 degrees and 0.1 % of the distance"
+
+
+def test_results_say_how_exact_they_are_and_what_the_distance_holds_for():
+    covariance = torch.diag(torch.tensor([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3]).double())
+    result = registration(covariance, confidence=0.95)
+    document = result.to_dict()
+    assert document["exactness"]["words"] == result.exactness.words
+    (line,) = remarks(document)
+    assert line.startswith("exact to about 0.8 degrees and 3 % of the distance")
+    assert "the mesh has the object's size and the focal length is right" in line
+    (line,) = remarks({**document, "camera_source": "estimated"})
+    assert "use allocentric_rotation" in line
+    assert document["allocentric_rotation"] == result.allocentric_rotation.tolist()
+    assert replace(result, probabilities=(0.5,)).to_dict()["exactness"] is None

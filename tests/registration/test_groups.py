@@ -1,0 +1,141 @@
+"""Answers that count as one: turns about an axis, and pairs."""
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from torch import Tensor
+
+from curvireg_torch import Registrar, Registration, ViewBank, sample_views
+from curvireg_torch.geometry import rotation_from_viewpoint
+from curvireg_torch.mesh.round_axis import RoundAxis
+from curvireg_torch.registration.confidence import probability_of_any, shares
+from curvireg_torch.registration.groups import (
+    AXIS_TOLERANCE,
+    Axis,
+    Rivals,
+    axis_of,
+    directions_agree,
+    pair_probability,
+)
+from curvireg_torch.visualization.contours import AXIS
+from curvireg_torch.visualization.overlay import contour_overlay, registration_sheet
+from tests._support.canisters import canister
+from tests._support.results import registration
+from tests._support.scenes import CAMERA
+from tests.registration.test_ties import hollow_box, photograph, registrar_of
+
+FEATURES = {
+    "similarity": 0.7,
+    "margin": 0.1,
+    "edge_support": 0.6,
+    "contours": 0.4,
+    "ranking_share": 0.3,
+    "keypoints": 0.0,
+    "unmatched": 0.0,
+    "undetermined": 1.2,
+    "outside": 0.0,
+    "border": 0.0,
+    "focal": 0.0,
+}
+UPRIGHT = RoundAxis(torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double(), False)
+
+
+def turned(*viewpoints: tuple[float, float]) -> Tensor:
+    return torch.stack([rotation_from_viewpoint(a, e, 0.0).double() for a, e in viewpoints])
+
+
+def rivals_of(*viewpoints: tuple[float, float], scores: list[float]) -> Rivals:
+    values = torch.tensor(scores).double()
+    views = turned((0.0, 20.0), (90.0, 20.0), (180.0, 20.0), (0.0, -70.0)).float()
+    ranked = torch.tensor([1.0, 0.9, 0.95, 0.8])
+    return Rivals(turned(*viewpoints), values, values - 0.5, FEATURES, views, ranked)
+
+
+@cache
+def of_canister() -> tuple[Registrar, Registration, tuple[Tensor, Tensor, Tensor]]:
+    """Seen from where the turn is hard to tell."""
+    views = sample_views(azimuth_step=15, elevations=[-50, -25, 0, 25, 50])
+    registrar = Registrar(ViewBank.build(canister(), views, image_size=96, progress=False))
+    image, box, T = photograph(canister(), 160.0, 40.0, 1)
+    return registrar, registrar([image], box[None], CAMERA)[0], (image, box, T)
+
+
+def test_the_axis_of_a_canister_is_certain_where_its_turn_is_not():
+    registrar, result, (_, _, T) = of_canister()
+    assert result.verdict == "reliable axis"
+    assert not result.reliable
+    expected = T[:3, :3] @ registrar.round_axis.direction
+    angle = torch.rad2deg((result.axis.direction @ expected).acos())
+    assert float(angle) < 2.0
+    assert result.axis.probability > 0.95 > result.confidence
+    assert result.to_dict()["axis"] == result.axis.to_dict()
+
+
+def test_the_axis_is_drawn_where_it_alone_is_certain():
+    registrar, result, (image, box, _) = of_canister()
+    assert (contour_overlay(registrar, result, image, box) == torch.tensor(AXIS).numpy()).all(
+        -1
+    ).sum() > 50
+    plain = replace(result, axis=None)
+    picture = contour_overlay(registrar, plain, image, box)
+    assert not (picture == torch.tensor(AXIS).numpy()).all(-1).any()
+    assert registration_sheet(registrar, result, image, box).shape[1] > 0
+
+
+def test_a_pair_has_a_probability_of_its_own():
+    registrar = registrar_of(hollow_box())
+    image, box, _ = photograph(hollow_box(), 35.0, 25.0, 0)
+    result = registrar([image], box[None], CAMERA)[0]
+    assert result.ambiguous == "half turn"
+    assert result.axis is None
+    assert result.confidence < 0.6
+    assert result.pair_probability > 0.9
+    assert result.to_dict()["pair_probability"] == result.pair_probability
+
+
+def test_axes_agree_by_their_direction_whatever_the_turn():
+    rotations = turned((0.0, 20.0), (170.0, 20.0), (40.0, 34.0), (40.0, 36.0))
+    agree = directions_agree(rotations, UPRIGHT, AXIS_TOLERANCE)
+    assert agree.tolist() == [True, True, True, False]
+    upside_down = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    both = torch.stack([rotations[0], rotations[0] @ upside_down])
+    assert directions_agree(both, UPRIGHT, AXIS_TOLERANCE).tolist() == [True, False]
+    either = UPRIGHT._replace(ends_are_alike=True)
+    assert directions_agree(both, either, AXIS_TOLERANCE).tolist() == [True, True]
+
+
+def test_a_group_is_judged_by_its_margin_to_the_others():
+    rivals = rivals_of((0.0, 20.0), (90.0, 22.0), (0.0, -70.0), scores=[3.0, 2.9, 1.0])
+    axis = axis_of(rivals, UPRIGHT, rivals.rotations[0])
+    assert axis.direction.tolist() == pytest.approx(rivals.rotations[0][:, 2].tolist())
+    weights = torch.tensor([1.0, 0.9, 0.95, 0.8]).double() ** 4
+    share = float(weights[:3].sum() / weights.sum())
+    features = {**FEATURES, "margin": 2.0, "ranking_share": share, "undetermined": 0.2}
+    group = shares(rivals.scores, exact=True)[:2].sum()
+    expected = probability_of_any(features, exact=True) * float(group)
+    assert axis.probability == pytest.approx(expected)
+
+
+def test_the_margin_of_a_pair_is_that_to_the_third():
+    rivals = rivals_of((0.0, 20.0), (180.0, 20.0), (90.0, 20.0), scores=[3.0, 2.9, 1.5])
+    weights = torch.tensor([1.0, 0.9, 0.95, 0.8]).double() ** 4
+    share = float((weights[0] + weights[2]) / weights.sum())
+    features = {**FEATURES, "margin": 1.5, "ranking_share": share}
+    group = shares(rivals.scores, exact=True)[:2].sum()
+    expected = probability_of_any(features, exact=True) * float(group)
+    assert pair_probability(rivals, None) == pytest.approx(expected)
+
+
+def test_an_axis_is_reliable_only_without_doubts():
+    sure = Axis(torch.tensor([0.0, 0.0, 1.0]).double(), 0.9)
+    result = replace(registration(confidence=0.4), axis=sure)
+    assert result.verdict == "reliable axis"
+    assert replace(result, warnings=("of the box",)).verdict != "reliable axis"
+    assert replace(result, prior_contradiction="better outside").verdict != "reliable axis"
+    assert replace(result, axis=replace(sure, probability=0.89)).verdict != "reliable axis"
+    half = replace(result, pair_probability=0.8).scaled(0.5)
+    assert half.axis.probability == pytest.approx(0.45)
+    assert half.pair_probability == pytest.approx(0.4)
+    assert half.probabilities == pytest.approx((0.2, 0.0))

@@ -1,0 +1,126 @@
+"""Several meshes that may be the object: rivals, of which none is believed where two fit."""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch import Registrar, Registration, sample_views
+from curvireg_torch.errors import LostObjectError
+from curvireg_torch.fitting.details import ContourDetails
+from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.registration import FailedRegistration
+from curvireg_torch.registration.rival_meshes import best_of_meshes, joined
+from tests._support.results import registration
+from tests._support.scenes import CAMERA, learned_registrar
+from tests.registration.test_ties import photograph
+
+
+@cache
+def truck(*, with_cabin: bool = True) -> trimesh.Trimesh:
+    parts = [
+        trimesh.creation.box((200, 90, 50)),
+        trimesh.creation.box((20, 30, 30)).apply_translation((90, 20, 40)),
+    ]
+    if with_cabin:
+        parts.append(trimesh.creation.box((50, 80, 60)).apply_translation((-60, 0, 55)))
+    return trimesh.util.concatenate(parts)
+
+
+def registered(shown: trimesh.Trimesh, *meshes: trimesh.Trimesh) -> Registration:
+    views = sample_views(azimuth_step=15, elevations=[10, 30, 50])
+    settings = BankSettings(image_size=96)
+    registrar = Registrar(list(meshes), views=views, settings=settings, progress=False)
+    image, box, _ = photograph(shown, 35.0, 25.0, 0)
+    return registrar([image], box[None], CAMERA)[0]
+
+
+def test_one_shape_in_two_sizes_is_named_and_not_reliable():
+    larger = truck().copy()
+    larger.apply_scale(1.2)
+    for meshes in ((truck(), larger), (larger, truck())):
+        result = registered(truck(), *meshes)
+        assert not result.reliable
+        assert result.ambiguous == "mesh 0 or 1"
+        assert sum(result.mesh_probabilities) > 0.9
+        assert result.no_match_probability < 0.1
+        assert result.to_dict()["mesh_probabilities"] == list(result.mesh_probabilities)
+
+
+@pytest.mark.parametrize("with_cabin", [True, False])
+def test_a_variant_with_a_part_more_is_told_from_that_without(with_cabin):
+    meshes = truck(), truck(with_cabin=False)
+    for order in (meshes, meshes[::-1]):
+        result = registered(truck(with_cabin=with_cabin), *order)
+        assert order[result.mesh_index] is truck(with_cabin=with_cabin) or order[
+            result.mesh_index
+        ].volume == pytest.approx(truck(with_cabin=with_cabin).volume)
+        assert result.ambiguous is None
+
+
+def result_of(similarity: float, confidence: float, rival: float = 0.1) -> Registration:
+    made = registration(confidence=confidence)
+    names = "rank", "similarity", "edge_support", "appearance", "keypoints", "details", "contours"
+    nothing = dict.fromkeys(names, 0.0)
+    hypotheses = tuple(
+        replace(hypothesis, evidence={**nothing, "similarity": value})
+        for hypothesis, value in zip(made.hypotheses, (similarity, rival), strict=True)
+    )
+    return replace(made, hypotheses=hypotheses)
+
+
+def best(*results: Any) -> Any:
+    return best_of_meshes(results, [learned_registrar()] * len(results))
+
+
+def test_the_mesh_with_the_higher_score_is_the_answer_and_keeps_its_confidence():
+    low = result_of(0.2, 0.4)
+    high = result_of(0.8, 0.9)
+    for results, index in (((low, high), 1), ((high, low), 0)):
+        found = best(*results)
+        assert found.mesh_index == index
+        assert found.confidence == pytest.approx(0.9, abs=0.01)
+        assert found.ambiguous is None
+
+
+def test_meshes_with_equal_scores_share_the_probability():
+    found = best(result_of(0.8, 0.96), result_of(0.8, 0.9), result_of(0.1, 0.2))
+    assert found.mesh_probabilities == pytest.approx((0.48, 0.48, 0.0), abs=0.01)
+    assert found.mesh_index == 0
+    assert found.confidence == pytest.approx(0.48, abs=0.01)
+    assert found.ambiguous == "mesh 0 or 1"
+
+
+def test_meshes_that_fail_are_left_out():
+    failed = FailedRegistration(LostObjectError("not found"))
+    one = result_of(0.8, 0.9)
+    assert best(failed, one).mesh_index == 1
+    assert best(one, failed).confidence == 0.9
+    assert best(failed, failed) is failed
+    found = best(failed, one, result_of(0.8, 0.9))
+    assert found.mesh_probabilities == pytest.approx((0.0, 0.45, 0.45))
+
+
+def test_without_probabilities_the_higher_score_decides():
+    one = replace(result_of(0.8, 0.9), probabilities=())
+    other = result_of(0.5, 0.9)
+    other = replace(
+        other,
+        probabilities=(),
+        hypotheses=tuple(replace(h, score=0.9) for h in other.hypotheses),
+    )
+    assert best(one, other).mesh_index == 1
+    assert best(one, one).mesh_index == 0
+
+
+def test_details_of_meshes_with_fewer_points_are_filled_with_invalid_ones():
+    def details(count: int) -> ContourDetails:
+        ones = torch.ones(1, count)
+        return ContourDetails(torch.ones(1, count, 2), ones, ones.bool(), ones.bool())
+
+    both = joined([details(3), details(5)])
+    assert both.uv.shape == (2, 5, 2)
+    assert both.valid.sum(dim=1).tolist() == [3, 5]
