@@ -165,7 +165,8 @@ def turn_with_ray(position: Tensor) -> Tensor:
     rows = [zero, -z, y], [z, zero, -x], [-y, x, zero]
     across = torch.stack([torch.stack(row) for row in rows])  # ray x difference
     roll = torch.stack([y, -x, zero]) / (1.0 + z)
-    return (across + torch.outer(ray, roll)) / distance
+    turn: Tensor = (across + torch.outer(ray, roll)) / distance
+    return turn
 
 
 def pose_from_box(

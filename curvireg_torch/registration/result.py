@@ -490,7 +490,7 @@ class Registration:
 
     def _exactness_dict(self) -> dict[str, Any] | None:
         exactness = self.exactness
-        return exactness and {**vars(exactness), "words": exactness.words}
+        return None if exactness is None else {**vars(exactness), "words": exactness.words}
 
     @property
     def _frame(self) -> str:
