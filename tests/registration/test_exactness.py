@@ -82,7 +82,7 @@ def test_results_say_how_exact_they_are_and_what_the_distance_holds_for():
     document = result.to_dict()
     assert document["exactness"]["words"] == result.exactness.words
     (line,) = remarks(document)
-    assert line.startswith("exact to about 0.8 degrees and 3 % of the distance")
+    assert line.startswith("exact to about 0.8 degrees and 1 % of the distance")
     assert "the mesh has the object's size and the focal length is right" in line
     (line,) = remarks({**document, "camera_source": "estimated"})
     assert "use allocentric_rotation" in line

@@ -125,6 +125,8 @@ def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_dete
 
 def test_a_rotation_that_is_not_determined_is_not_reliable_unless_the_object_is_round():
     sure = registration(covariance=1e-4 * torch.eye(6).double(), confidence=0.95)
+    fitted = tuple(replace(hypothesis, edge_support=0.6) for hypothesis in sure.hypotheses)
+    sure = replace(sure, hypotheses=fitted)
     for undetermined, is_reliable in ((0.99, True), (1.0, False)):
         result = replace(sure, confidence_features={"undetermined": undetermined})
         assert result.reliable == is_reliable
