@@ -18,7 +18,8 @@ import pytest
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.jobs import outputs, ros
+from curvireg_torch.formats.exports import ros
+from curvireg_torch.jobs import outputs
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.visualization import sheet
 from tests._support.lists import CAMERA, box_of, table, written
