@@ -234,8 +234,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.views is not None or (
         arguments.list is None and is_one_photograph(arguments.photos)
     ):
-        # Before the folder is made, or what it held of an earlier run is deleted.
-        check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
         with _one_result(arguments):
             reliable = _register_alone(arguments)
         return NONE_RELIABLE if arguments.strict and not reliable else 0

@@ -297,7 +297,8 @@ def register_list(
     }
     with output_folder(out, "register several", inputs=files, source=source):
         store = run_entries(usable, out, open_registrar, **how)
-        if removed := len(store) - len(usable):
+        asked = {dict(entry.cells).get("photo") for entry in entries}
+        if removed := sum(photo not in asked for photo in store.photos()):
             text = f"{out}: {removed} results of photographs that are not asked for any more go"
             warnings.warn(text, CurviregWarning, stacklevel=2)
         return _write_tables(entries, out, store)

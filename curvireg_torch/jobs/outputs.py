@@ -59,7 +59,8 @@ def output_folder(
     source: Sequence[str] = (),
     more: Sequence[str] = (),
 ) -> Iterator[None]:
-    """Context in which ``command`` may write its files into ``folder``, which is created.
+    """Context in which ``command`` may write its files into ``folder``, which is created, and goes
+    again if nothing was written.
 
     Args:
         folder: of the results.
@@ -80,6 +81,7 @@ def output_folder(
     written = _read(folder)
     for path in in_the_way:
         _check_owner(path, command, written)
+    is_new = not folder.exists()
     check_writable(folder)
     with _locked(folder):
         before = _read(folder).get(command, {})
@@ -92,8 +94,18 @@ def output_folder(
         try:
             yield
         finally:
+            written_now = [path.name for path in _existing(folder, names)]
             with suppress(OutputError):  # an error of the command itself counts more
-                _mark(folder, command, [path.name for path in _existing(folder, names)], kept)
+                _mark(folder, command, written_now, kept)
+            if is_new and not written_now:
+                _remove_unused(folder)
+
+
+def _remove_unused(folder: Path) -> None:
+    """Remove a folder that holds a marker alone."""
+    if [path.name for path in folder.iterdir()] == [MARKER]:
+        (folder / MARKER).unlink()
+        folder.rmdir()
 
 
 @contextmanager

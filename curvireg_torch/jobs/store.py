@@ -72,6 +72,11 @@ class ResultStore:
         row: Row = json.loads(self._rows[key][1])
         return row
 
+    def photos(self) -> list[str]:
+        """The photographs of rows of finished runs, as their lists named them."""
+        columns = [json.loads(line).get("columns", {}) for _, line in self._rows.values()]
+        return [cells["photo"] for cells in columns if "photo" in cells]
+
     def append(self, row: Row) -> None:
         """Put a row on disk; numbers that are not finite become null. :class:`OutputError` if this
         fails."""
