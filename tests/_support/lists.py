@@ -18,7 +18,7 @@ RESULTS = [
     *("verdict", "message", "confidence", "reliable"),
     *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
 ]
-RESULTS += ["tx", "ty", "tz"]
+RESULTS += ["tx", "ty", "tz", "exactness"]
 
 
 def write_files(folder):

@@ -99,7 +99,7 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
                 "failed",
                 "",
                 "false",
-                *[""] * 12,
+                *[""] * 13,
             ]
         else:
             assert (row["verdict"], row["message"]) == ("unsure", "")
