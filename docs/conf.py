@@ -34,9 +34,13 @@ nitpicky = True
 nitpick_ignore = [  # types of annotations without a page
     ("py:class", "Image"),
     ("py:class", "curvireg_torch.matching.cells.Packing"),
+    ("py:class", "curvireg_torch.mesh.round_axis.RoundAxis"),
+    ("py:class", "curvireg_torch.registration.exactness.Exactness"),
     ("py:class", "curvireg_torch.registration.framing.CropFrame"),
     ("py:class", "curvireg_torch.registration.shape_symmetries.TellingSymmetries"),
+    ("py:class", "curvireg_torch.registration.groups.Axis"),
     ("py:class", "curvireg_torch.rendering.contours._Level"),
+    ("py:class", "curvireg_torch.utils.executors.Workers"),
 ]
 html_math_renderer = "mathml"  # nothing is fetched from elsewhere
 

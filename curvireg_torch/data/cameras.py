@@ -10,7 +10,7 @@ from ..geometry.calibration import Camera
 
 
 def load_camera(path: str | os.PathLike[str]) -> Camera:
-    """The camera of a calibration file, ``FILE`` or ``FILE:NAME``; :func:`.read_camera` names the
+    """The camera of a calibration file, ``FILE`` or ``FILE:NAME``; ``read_camera`` names the
     formats.
 
     Raises:

@@ -72,7 +72,7 @@ class ImageItem:
     what is questionable about them; ``focal_deviation`` and ``camera_source`` as in
     :class:`Camera`.
 
-    What strangers give is checked by :func:`image_item`, once.
+    What strangers give is checked by ``image_item``, once.
     """
 
     image: Tensor

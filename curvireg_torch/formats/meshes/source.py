@@ -24,7 +24,7 @@ MAX_PART_BYTES = 255
 
 @dataclass(frozen=True)
 class MeshWarning:
-    """What a mesh lacks, or what was changed in it; :func:`read_mesh` returns
+    """What a mesh lacks, or what was changed in it; ``read_mesh`` returns
     them.
 
     Attributes:
