@@ -50,8 +50,8 @@ from .unknown_camera import (
 Result = Registration | CurviregError
 
 BLOCK = {"cpu": 8}
-"""Photographs in a block by the kind of device: on a CPU more of them take more memory and no less
-time."""
+"""Photographs in a block by the kind of device; their crops and pictures are in memory together.
+Chosen, not measured."""
 BLOCK_OF_DEVICE = 64
 
 
@@ -122,10 +122,12 @@ def _with_corrected_boxes(
     """Results, with those of another box where the pose asks for one in which it is seen better."""
     found = list(results)
     changed: dict[int, ImageItem] = {}
+    boxes: dict[int, Tensor] = {}
     for index, (item, result) in enumerate(zip(items, results, strict=True)):
         if isinstance(item, ImageItem) and isinstance(result, Registration):
             box = _other_box(target, item, result)
             if box is not None:
+                boxes[index] = box
                 changed[index] = replace(item, box=box.float())
     weights = target.score_weights(exact=True)
     others = register_boxes(target, list(changed.values()))
@@ -135,8 +137,7 @@ def _with_corrected_boxes(
             continue
         before = common_score(result.hypotheses[0], weights)
         if common_score(other.hypotheses[0], weights) > before:
-            box = projected_box(target.describer, result.projection)
-            found[index] = replace(other, corrected_box=box)
+            found[index] = replace(other, corrected_box=boxes[index])
     return found
 
 
@@ -232,10 +233,10 @@ def register(
     poses = _with_views_again(target, block, poses[other], begun[other])
     if block.crops is not None:
         block, poses = with_focal_deviation(target, block, block.crops, poses)
-    results = judge(target, block, Hypotheses.cat([poses, rivals]), feature_is_hidden)
+    compared = Hypotheses.cat([poses, rivals])
+    results = judge(target, block, compared, feature_is_hidden)
     if block.crops is None or not block.exact:
         return results
-    compared = Hypotheses.cat([poses, rivals])
     best = compared[compared.best(target.score_weights(exact=True))]
     results = compared_with_mirror_image(target, block, block.crops, best, results)
     return with_checked_cameras(target, block, block.crops, best, results)
