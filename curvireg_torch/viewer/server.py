@@ -3,6 +3,7 @@ uploads."""
 
 import errno
 import ipaddress
+import logging
 import os
 import re
 import secrets
@@ -59,6 +60,7 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
     token."""
     # The page's shutdown removes what is in the folder; a job that still runs may add to it.
     uploads = tempfile.TemporaryDirectory(prefix="curvireg-view-", ignore_cleanup_errors=True)
+    logging.getLogger("nicegui").addFilter(is_worth_saying)
     with terminable(), listen(host, port) as listener, uploads as folder:
         workspace = Workspace(options, Path(folder))
         workspace.load()  # errors come before anything opens
@@ -70,6 +72,11 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
             warnings.showwarning = show_warning
             with suppress(KeyboardInterrupt):  # uvicorn raises it again once the server has ended
                 server.run(sockets=[listener])
+
+
+def is_worth_saying(record: logging.LogRecord) -> bool:
+    """False for NiceGUI's complaint, on a busy machine, that tasks end late when the page ends."""
+    return not record.getMessage().startswith("Could not cancel")
 
 
 def make_server(

@@ -1,4 +1,5 @@
 import asyncio
+import logging
 import os
 import re
 import socket
@@ -13,6 +14,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.viewer.server import (
     SECURITY_HEADERS,
     guarded,
+    is_worth_saying,
     listen,
     print_address,
     redirect_file,
@@ -211,3 +213,14 @@ def test_the_server_answers_plain_requests(address):
     with socket.create_connection((parts.hostname, parts.port), timeout=60) as plain:
         plain.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil.example\r\n\r\n")
         assert plain.recv(100).startswith(b"HTTP/1.1 400 ")
+
+
+def test_ctrl_c_on_a_busy_machine_says_nothing(caplog):
+    log = logging.getLogger("nicegui")
+    log.addFilter(is_worth_saying)
+    try:
+        log.error("Could not cancel %s tasks within timeout: %s", 7, "")
+        log.error("disk full")
+    finally:
+        log.removeFilter(is_worth_saying)
+    assert [record.getMessage() for record in caplog.records] == ["disk full"]
