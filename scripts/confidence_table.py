@@ -4,8 +4,8 @@
 
 The tables of generated photographs are written from scripts/results/calibration.json. RUN are
 folders that ``curvireg evaluate`` wrote: their results.jsonl have the confidences, their errors.csv
-the errors. Their table is written if there are any, its values into
-scripts/results/confidence.json.
+the errors. Their rows replace those of the same sets in scripts/results/confidence.json, and the
+table is written from it.
 """
 
 import argparse
@@ -72,10 +72,21 @@ def main() -> None:
     update_page(page, "generated", generated_part(calibration))
     update_page(page, "withheld", table_of_withheld(calibration["held out"]["instance"]["sets"]))
     if options.run:
-        rows = [measured(run) for run in options.run]
+        path = RESULTS / "confidence.json"
+        stored = json.loads(path.read_text(encoding="utf-8"))["sets"] if path.exists() else []
+        rows = merged(stored, [measured(run) for run in options.run])
         record = {"date": today(), "commit": commit(), "sets": rows}
-        write_json(RESULTS / "confidence.json", record)
+        write_json(path, record)
         update_page(page, "confidence", table(rows))
+
+
+def merged(
+    stored: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]]
+) -> list[Mapping[str, Any]]:
+    """The stored rows, of which new ones of the same name take the place, then the other new
+    ones."""
+    of_name = {row["name"]: row for row in stored} | {row["name"]: row for row in rows}
+    return list(of_name.values())
 
 
 def measured(run: Path) -> dict[str, Any]:

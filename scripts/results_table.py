@@ -12,8 +12,9 @@ changes), so record it right after measuring.
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
@@ -47,13 +48,15 @@ WORDS = {
     "visp_boxes": "Boxes and cubes, of meshes without their print",
     "lego": "A LEGO model",
     "tless_tiago": "Industrial parts without texture (T-LESS)",
-    "tracebot": "Transparent canisters",
+    "tracebot": "Transparent canisters and a tray",
     "lm": "Two figurines among clutter (LINEMOD)",
     "lmo": "Small objects behind others (LINEMOD-Occlusion)",
     "pascal3d_mini": "Cars, chairs and other things of the web, with another one's mesh and "
     "without a camera (PASCAL3D+)",
 }
 """What a set shows, in the order of the README's table."""
+
+RIGHT = 30.0  # degrees
 
 LIGHTINGS = {"hope": 5, "hope_print": 5}  # per view; objects of these sets are not independent
 
@@ -129,23 +132,47 @@ def stored_records(results: Path) -> list[dict[str, Any]]:
 def table_in_words(results: Path) -> str:
     """Markdown for readers who know none of the sets; sets without words are left out."""
     records = {record["name"]: record for record in stored_records(results)}
-    confidences = results / "confidence.json"
-    sets = (
-        json.loads(confidences.read_text(encoding="utf-8"))["sets"] if confidences.exists() else []
-    )
-    of_set = {each["name"]: each for each in sets}
-    rows = [["objects", "number", "within 30°", "median error", "called reliable: of these right"]]
+    of_set = {each["name"]: each for each in stored(results / "confidence.json").get("sets", ())}
+    rows = [
+        ["objects", "number", "within 30°", "median error", "called reliable", "of these right"]
+    ]
     for name, words in WORDS.items():
         if name not in records:
             continue
         summary = records[name]["summary"]
         right = summary.get("acc_30_deg", summary.get("acc_pi_6"))
-        sure = of_set.get(name)
-        believed = "-" if sure is None else f"{sure['reliable']}: {sure['reliable_right']}"
+        sure = of_set.get(name, {})
+        believed = [str(sure.get(key, "-")) for key in ("reliable", "reliable_right")]
         values = [percent(right), degrees(summary["med_err_deg"])]
-        rows.append([words, counted(name, summary["n"]), *values, believed])
-    commits = sorted({records[name]["commit"] for name in WORDS if name in records})
-    return "\n".join([*table_lines(rows), "", f"Commit {', '.join(commits)}.", ""])
+        rows.append([words, counted(name, summary["n"]), *values, *believed])
+    commits = {records[name]["commit"] for name in WORDS if name in records}
+    followed = stored(results / "videos.json")
+    if followed:
+        rows.insert(-1, video_row(followed["videos"]))  # PASCAL3D+ stays last
+        commits.add(followed["commit"])
+    named = ", ".join(sorted(commits))
+    return "\n".join([*table_lines(rows), "", f"Commit {named}.", ""])
+
+
+def stored(path: Path) -> dict[str, Any]:
+    """A record, empty if there is none."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+
+def video_row(videos: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The row of the frames that scripts/videos.py followed."""
+    errors = [error for video in videos for error in video["errors_deg"]]
+    verdicts = [verdict for video in videos for verdict in video["verdicts"]]
+    trusted = [e for e, verdict in zip(errors, verdicts, strict=True) if verdict == "reliable"]
+    right = sum(error < RIGHT for error in errors) / len(errors)
+    return [
+        f"Frames of {len(videos)} videos, each followed from its first frame",
+        str(len(errors)),
+        percent(right),
+        degrees(median(errors)),
+        str(len(trusted)),
+        str(sum(error < RIGHT for error in trusted)),
+    ]
 
 
 def table(results: Path) -> str:

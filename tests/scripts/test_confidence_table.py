@@ -8,6 +8,7 @@ from scripts.confidence_table import (
     GENERATED,
     generated_part,
     measured,
+    merged,
     table,
     table_of_generated,
     table_of_withheld,
@@ -37,6 +38,12 @@ def test_confidences_are_counted(tmp_path, column):
     assert row["right"] == 0.5
     assert row["auc"] == 0.5  # of the pairs of right and wrong: ab -, ad +, cb -, cd +
     assert "| `set` | 4 | 0.56 | 0.50 | 2 | 1 | 2 | 0.50 |" in table([row])
+
+
+def test_new_rows_replace_those_of_the_same_set():
+    stored = [{"name": "a", "n": 1}, {"name": "b", "n": 2}]
+    rows = merged(stored, [{"name": "c", "n": 3}, {"name": "a", "n": 4}])
+    assert [(row["name"], row["n"]) for row in rows] == [("a", 4), ("b", 2), ("c", 3)]
 
 
 def test_one_kind_of_answers_has_no_order(tmp_path):

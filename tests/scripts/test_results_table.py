@@ -64,11 +64,26 @@ def test_the_table_in_words_names_what_a_set_shows(tmp_path: Path, results: Path
     (results / "confidence.json").write_text(json.dumps({"sets": sets}))
     lines = results_table.table_in_words(results).splitlines()
     assert lines[2:4] == [
-        "| A plaster figurine | 8 | 75.0 % | 3.2° | 5: 4 |",
-        "| A LEGO model | 8 | 75.0 % | 3.2° | - |",
+        "| A plaster figurine | 8 | 75.0 % | 3.2° | 5 | 4 |",
+        "| A LEGO model | 8 | 75.0 % | 3.2° | - | - |",
     ]
     assert lines[4:] == ["", f"Commit {_shared.commit()}."]
     assert list(results_table.WORDS)[-1] == "pascal3d_mini"
+
+
+def test_followed_frames_are_a_row_before_the_last(tmp_path: Path, results: Path) -> None:
+    for name in ("lego", "pascal3d_mini"):
+        results_table.record(write_summary(tmp_path / name), name)
+    videos = [
+        {"errors_deg": [1.0, 31.0], "verdicts": ["reliable", "reliable"]},
+        {"errors_deg": [3.0, float("inf"), 2.0], "verdicts": ["reliable", "lost", "unsure"]},
+    ]
+    (results / "videos.json").write_text(json.dumps({"commit": "abc", "videos": videos}))
+    lines = results_table.table_in_words(results).splitlines()
+    name = "Frames of 2 videos, each followed from its first frame"
+    assert lines[3] == f"| {name} | 5 | 60.0 % | 3.0° | 3 | 2 |"
+    assert lines[4].startswith("| Cars, chairs")
+    assert lines[-1] == f"Commit {', '.join(sorted((_shared.commit(), 'abc')))}."
 
 
 def test_sets_of_several_lightings_count_views(tmp_path: Path, results: Path) -> None:

@@ -73,8 +73,9 @@ class Browser:
                 error = None
             except Exception as caught:  # the page is not ready
                 error = caught
-            said = f"{self.text('progress')!r}, {self.messages()!r}"
-            assert time.monotonic() < deadline, f"{what}; page says {said}; {error}"
+            if time.monotonic() > deadline:
+                said = f"{self.text('progress')!r}, {self.messages()!r}"
+                raise AssertionError(f"{what}; page says {said}; {error}")
             time.sleep(0.1)
 
     def click(self, name):

@@ -1,0 +1,63 @@
+"""Follow the object of each video, and store how exact its poses are.
+
+    python scripts/videos.py FOLDER ... [--record]
+
+A folder holds frames/NAME.jpg, mesh.ply, camera.json (fx, fy, cx, cy) and truth.json: by NAME, R
+and t in the mesh's unit, mm. The box of the first frame is that of the true pose. Errors are up to
+the symmetries of the shape.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import curvireg_torch as cr
+from curvireg_torch.data import read_image
+from curvireg_torch.evaluation.metrics import symmetric_rotation_error
+from curvireg_torch.geometry import projected_boxes, transform
+from curvireg_torch.registration import Follower
+from scripts._shared import RESULTS, commit, today, write_json
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", nargs="+", type=Path)
+    parser.add_argument("--record", action="store_true", help="store it for the README's table")
+    options = parser.parse_args()
+    videos = [followed(folder) for folder in options.folder]
+    print(json.dumps(videos, indent=2))
+    if options.record:
+        record = {"date": today(), "commit": commit(), "videos": videos}
+        write_json(RESULTS / "videos.json", record)
+
+
+def followed(folder: Path) -> dict[str, Any]:
+    """Name, errors in degrees, inf where there is no pose, and verdicts of the frames of a video."""
+    values = json.loads((folder / "camera.json").read_text())
+    K = cr.camera_matrix(*(values[name] for name in ("fx", "fy", "cx", "cy")))
+    registrar = cr.Registrar(cr.load_mesh(folder / "mesh.ply", unit="mm"))
+    symmetries = registrar.symmetries_of(exact=True)[:, :3, :3]
+    follow = Follower(registrar, K)
+    box = None
+    errors = []
+    verdicts = []
+    for name, pose in json.loads((folder / "truth.json").read_text()).items():
+        T = transform(*(torch.tensor(pose[key]).double() for key in ("R", "t")))
+        is_first = not errors
+        box = projected_boxes(registrar.describer.hull, T[None], K)[0] if is_first else None
+        result = follow(read_image(folder / "frames" / f"{name}.jpg"), box)
+        verdicts.append(result.verdict)
+        error = torch.tensor([torch.inf])
+        if result.ok:
+            error = symmetric_rotation_error(result.rotation[None], T[None, :3, :3], symmetries)
+        errors.append(round(float(error), 2))
+    return {"name": folder.name, "errors_deg": errors, "verdicts": verdicts}
+
+
+if __name__ == "__main__":
+    main()
