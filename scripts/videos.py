@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def followed(folder: Path) -> dict[str, Any]:
-    """Name, errors in degrees, inf where there is no pose, and verdicts of the frames of a video."""
+    """Name of a video; of its frames errors in degrees, inf without a pose, and verdicts."""
     values = json.loads((folder / "camera.json").read_text())
     K = cr.camera_matrix(*(values[name] for name in ("fx", "fy", "cx", "cy")))
     registrar = cr.Registrar(cr.load_mesh(folder / "mesh.ply", unit="mm"))
