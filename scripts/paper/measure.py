@@ -6,7 +6,7 @@ frame, and S_hog as the paper prints it; ``corrected`` is that with S_hog as a c
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -58,9 +58,11 @@ EPS = (1.0, 2.0, 3.0, 4.0)
 SHARES = (0.01, 0.02, 0.04, 0.08)
 RANKS = (1, 3, 5, 10, 20)
 BEST_PAIR = "CS/MFC"
+SEARCHED_PAIRS = PAIRS[:3]
 REFINED_PAIRS = ("CS/MFC", "CS/MCS")
 RIGHT_DEG = 30.0
 KNOWN_AZIMUTH_DEG = 45.0
+FOCUS_BATCH = 16  # photographs
 THRESHOLDS = (0.001, PAPER_THRESHOLD, 0.01, 0.03, 0.06, 0.1)
 
 
@@ -223,7 +225,8 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
             for photo in PHOTOS:
                 matcher.field = fields[photo]
                 for b, case in enumerate(cases):
-                    found = _ranked(matcher, crops[b], case, truths[b], errors[b], describe)
+                    wider = f"{depth}/{photo}" in SEARCHED_PAIRS
+                    found = _ranked(matcher, crops[b], case, truths[b], errors[b], describe, wider)
                     if variant == "corrected" and f"{depth}/{photo}" in REFINED_PAIRS:
                         found["refined"] = _closest_refined(
                             matcher, crops[b], case, truths[b], describe
@@ -256,24 +259,29 @@ def _ranked(
     truth: Tensor,
     errors: Tensor,
     describe: ViewDescriber,
+    wider: bool,
 ) -> Record:
+    """``wider``: with what the search finds between views down the ranking until two are
+    coherent."""
     query = matcher.features(crop[None])
     ranking = matcher.rank(query)
     # Views at several distances are one picture to an orthographic camera.
     top = different_views(matcher.bank.rotations, ranking.order[0], max(RANKS))
     rotation, _ = search(matcher, query, ranking)
-    wider, _ = search(matcher, query, ranking, least_coherent=2)
     retrieved = top[:BEST_VIEWS]
     closest = retrieved[errors[retrieved].argmin()]
-    return {
+    record: Record = {
         "top": errors[top].tolist(),
         "est": _pose_errors(rotation, case, truth, describe),
         "found": float(rotation_error(truth, rotation)),
         "coherent": len(coherent_of(matcher.bank, ranking)),
-        "wider": _pose_errors(wider, case, truth, describe),
-        "wider found": float(rotation_error(truth, wider)),
         "clo": _pose_errors(matcher.bank.rotations[closest], case, truth, describe),
     }
+    if wider:
+        if record["coherent"] == 1:
+            rotation, _ = search(matcher, query, ranking, least_coherent=2)
+        record["wider found"] = float(rotation_error(truth, rotation))
+    return record
 
 
 def _closest_refined(
@@ -303,42 +311,58 @@ def measure_focus(cases: list[Case], settings: BankSettings, pose: str) -> list[
     )
     bank = ViewBank.build(mesh, pipeline=pipeline, progress=False)
     matcher = ViewMatcher(bank, pipeline=pipeline)
-    fields = focus_fields()
-    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
     rotations = bank.rotations.double()
+    azimuths = torch.stack([viewpoint_from_rotation(R)[0] for R in rotations])
+    records: list[Record] = []
+    for k in range(0, len(cases), FOCUS_BATCH):
+        records += _focus_of(cases[k : k + FOCUS_BATCH], mesh, matcher, rotations, azimuths)
+    return records
+
+
+def _focus_of(
+    cases: Sequence[Case],
+    mesh: trimesh.Trimesh,
+    matcher: ViewMatcher,
+    rotations: Tensor,
+    azimuths: Tensor,
+) -> list[Record]:
+    """:func:`measure_focus` of some photographs, whose fields are computed together."""
+    fraction = matcher.bank.settings.point_fraction
+    crops = torch.cat([case.crop(matcher.bank.settings) for case in cases])
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    views: list[Tensor] = []
+    errors: list[dict[str, Tensor]] = []
+    near: list[Tensor] = []
     records: list[Record] = []
     for case in cases:
-        crop = case.crop(settings)
         R, distance = case.view(mesh)
-        true_field = matcher.describer.fields(R[None], torch.tensor([distance]).double())
-        view = field_points(true_field, fraction=settings.point_fraction)[0, 0]
-        errors = rotation_error(R, rotations)
-        turned = torch.minimum(errors, rotation_error(R @ half_turn, rotations))
-        azimuths = torch.stack([viewpoint_from_rotation(one)[0] for one in (R, *rotations)])
-        apart = ((azimuths[1:] - azimuths[0] + 180.0) % 360.0 - 180.0).abs()
-        near = apart <= KNOWN_AZIMUTH_DEG
-        right = (errors < RIGHT_DEG).double()
-        record: Record = {
-            "chance": {
-                "right": float(right.mean()),
-                "half turn": float((turned < RIGHT_DEG).double().mean()),
-                "azimuth": float(right[near].mean()),
-                "top 20": 1.0 - (1.0 - float(right.mean())) ** 20,
-            }
+        field = matcher.describer.fields(R[None], torch.tensor([distance]).double())
+        views.append(field_points(field, fraction=fraction)[0, 0])
+        of_view = rotation_error(R, rotations)
+        turned = torch.minimum(of_view, rotation_error(R @ half_turn, rotations))
+        errors.append({"right": of_view, "half turn": turned})
+        apart = ((azimuths - viewpoint_from_rotation(R)[0] + 180.0) % 360.0 - 180.0).abs()
+        near.append(apart <= KNOWN_AZIMUTH_DEG)
+        right = (of_view < RIGHT_DEG).double()
+        chance = {
+            "right": float(right.mean()),
+            "half turn": float((turned < RIGHT_DEG).double().mean()),
+            "azimuth": float(right[near[-1]].mean()),
+            "top 20": 1.0 - (1.0 - float(right.mean())) ** 20,
         }
-        for name, field in fields.items():
-            matcher.field = field
-            query = matcher.features(crop)
-            order = matcher.rank(query).order[0]
-            photo = query.points[0, 0]
-            record[name] = {
-                "ip": float(intersection_percentage(photo, view)),
-                "right": float(errors[order[0]]),
-                "half turn": float(turned[order[0]]),
-                "azimuth": float(errors[order[near[order]][0]]),
-                "top 20": float(errors[order[:20]].min()),
+        records.append({"chance": chance})
+    for name, matcher.field in focus_fields().items():
+        query = matcher.features(crops)
+        orders = matcher.rank(query).order
+        for b, order in enumerate(orders):
+            right = errors[b]["right"]
+            records[b][name] = {
+                "ip": float(intersection_percentage(query.points[b, 0], views[b])),
+                "right": float(right[order[0]]),
+                "half turn": float(errors[b]["half turn"][order[0]]),
+                "azimuth": float(right[order[near[b][order]][0]]),
+                "top 20": float(right[order[:20]].min()),
             }
-        records.append(record)
     return records
 
 

@@ -18,6 +18,7 @@ Value = Callable[[dict[str, Any]], float]
 PHOTOS = ("MFC", "MCS", "IG")
 REPEATED_DEPTHS = ("CS", "ASG", "HFN")
 PAIRS = printed.PAIRS
+SEARCHED_PAIRS = PAIRS[:3]
 RANKS = (1, 3, 5, 10, 20)
 GRIDS = (4, 8, 16)
 RIGHT_DEG = 30.0
@@ -400,7 +401,7 @@ def search_tables(records: Records) -> list[Table]:
         return lambda record: float(record[variant][pair][key] < RIGHT_DEG)
 
     for variant in VARIANTS:
-        for pair in PAIRS[:3]:
+        for pair in SEARCHED_PAIRS:
             kinds = ("found", "wider found")
             values = (more(variant, pair), _right(variant, pair, 1))
             values += tuple(found(variant, pair, kind) for kind in kinds)
