@@ -5,9 +5,9 @@ arbitrary. Each function has a module twin with the same options. The dtype is k
 compute in float32). Wrong shapes, dtypes, masks and options raise
 :class:`~curvireg_torch.errors.InvalidInputError`.
 
-Grey levels are kornia's. Gaussians and derivatives are own code, which gives the same results: on
-one CPU thread, forward and backward, kornia's take several times as long (``docs/kornia.md`` has
-the measurements).
+Grey levels, Gaussians and first derivatives of photographs are kornia's. In graphs, for depth, and
+on a CPU where gradients are wanted, sums of shifted images give the same in less time
+(``docs/kornia.md`` has the measurements).
 """
 
 from .curvilinear import DepthCurvilinearSaliency as DepthCurvilinearSaliency

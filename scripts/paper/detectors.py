@@ -17,6 +17,7 @@ from torch import Tensor
 
 from curvireg_torch.errors import MissingDependencyError
 from curvireg_torch.features import field_points
+from curvireg_torch.features.fields import FIELDS
 from curvireg_torch.features.hog import strongest_points
 from curvireg_torch.filters import (
     image_gradient,
@@ -193,9 +194,7 @@ def of_field(field: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
 
 
 DETECTORS: dict[str, Callable[..., Tensor]] = {
-    "mfc": of_field(
-        functools.partial(multiscale_focus_curves, mode="reblur-saliency", saliency_weight=0.0)
-    ),
+    "mfc": of_field(FIELDS["MFC"]()),
     "mfc x cs": of_field(multiscale_focus_curves),
     "mcs": of_field(multiscale_curvilinear_saliency),
     "ig": of_field(image_gradient),

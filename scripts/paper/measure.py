@@ -180,6 +180,11 @@ def _points_of(
             record["sensitivity"] |= {
                 f"{name} {share:g} {eps:g}": value for eps, value in zip(EPS, found, strict=True)
             }
+    record["threshold"] = {}
+    for threshold in THRESHOLDS:
+        field = FIELDS["MFC"](threshold=threshold)(crop)
+        points = field_points(field, fraction=settings.point_fraction)[0, 0]
+        record["threshold"][f"{threshold:.4f}"] = float(intersection_percentage(points, view))
     return record
 
 

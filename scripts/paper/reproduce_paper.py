@@ -65,10 +65,8 @@ OF_VIEWS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
 }
 OF_FOCUS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {"focus": paper.focus_tables}
 TABLES = (*OF_FOCUS, *OF_POINTS, *OF_VIEWS)
-ON_PAGE = ("detectors", "ip_classes", "hausdorff_classes", "repeatability", "curve", "precision")
-ON_PAGE += ("precision_classes", *(f"ranks_{variant}" for variant in paper.VARIANTS))
-ON_PAGE += (*(f"angles_{variant}" for variant in paper.VARIANTS), "search", "grids")
-ON_PAGE += ("sensitivity",)
+ON_PAGE = ("detectors", "ip_classes", "sensitivity", "repeatability", "curve", "precision")
+ON_PAGE += ("precision_classes", "ranks", "grids", "angles", "search")
 OF_FOCUS_PAGE = ("protocols", "thresholds")
 BLOCKS = {"protocols": OF_FOCUS_PAGE, "paper": ON_PAGE}
 """Tables between each pair of markers of the page; one that a folder has none of stays."""

@@ -24,7 +24,8 @@ GRIDS = (4, 8, 16)
 RIGHT_DEG = 30.0
 VARIANTS = ("literal", "printed", "corrected")
 NAMES = {"literal": "literal", "printed": "corrected, S_hog as printed", "corrected": "corrected"}
-SHOWN_OFFSETS = (-90, -45, -20, -10, -5, 0, 5, 10, 20, 45, 90)
+CLASS_DETECTORS = ("MFC", "MCS", "PCI", "SOBEL", "CANNY")
+SHOWN_OFFSETS = (-90, -20, -10, -5, 0, 5, 10, 20, 90)
 PARTS = ("elevation", "azimuth", "in-plane", "distance")
 POSE_COLUMNS = tuple(f"{name} {kind}" for name in PARTS for kind in ("Est.", "Clo."))
 
@@ -193,7 +194,7 @@ def detector_tables(records: Records) -> list[Table]:
             "ip",
             "IP by class",
             records,
-            {name: [at("ip", name)] for name in names},
+            {name: [at("ip", name)] for name in CLASS_DETECTORS},
             printed.IP_BY_CLASS,
             ("ours",),
             2,
@@ -202,7 +203,7 @@ def detector_tables(records: Records) -> list[Table]:
             "hausdorff",
             "Hausdorff distance by class",
             records,
-            {name: [at("hausdorff", name)] for name in names},
+            {name: [at("hausdorff", name)] for name in CLASS_DETECTORS},
             printed.HAUSDORFF_BY_CLASS,
             ("ours",),
             0,
@@ -265,12 +266,22 @@ def sensitivity_tables(records: Records) -> list[Table]:
     for share, eps in settings:
         cells = [records.mean(at("sensitivity", f"{name} {share:g} {eps:g}")) for name in names]
         rows.append([f"{100 * share:g} %", f"{eps:g} px", *cells])
+    # of these, the page has those in which one of the two is usual
+    shown = [row for row in rows if row[0] == "4 %" or row[1] == "2 px"]
+    thresholds = [
+        ["4 %", f"2 px, threshold {name}", records.mean(at("threshold", name)), *others]
+        for others in [["-"] * (len(names) - 1)]
+        for name in records.records[0]["threshold"]
+    ]
     text = (
-        f"IP with other shares of the pixels that are points, in photograph and view, and "
-        f"radii. "
-        f"{records.text}"
+        "IP with other shares of the pixels that are points, in photograph and view, radii, and "
+        f"thresholds of MFC (the paper: .0067). {records.text}"
     )
-    return [Table("sensitivity", "Sensitivity of IP", text, ["points", "eps", *names], rows)]
+    columns = ["points", "eps", *names]
+    return [
+        Table("sensitivity_all", "Sensitivity of IP", text, columns, [*rows, *thresholds]),
+        Table("sensitivity", "Sensitivity of IP", text, columns, [*shown, *thresholds]),
+    ]
 
 
 def _right(variant: str, pair: str, rank: int) -> Value:
@@ -318,7 +329,7 @@ def precision_tables(records: Records) -> list[Table]:
             "precision",
             "Precision by class",
             records,
-            {pair: [_right(variant, pair, 1) for variant in VARIANTS] for pair in PAIRS},
+            {pair: [_right(variant, pair, 1) for variant in VARIANTS] for pair in SEARCHED_PAIRS},
             printed.PRECISION_BY_CLASS,
             tuple(NAMES.values()),
             2,
@@ -339,17 +350,21 @@ def rank_tables(records: Records) -> list[Table]:
     )
     columns = ["depth / photograph", *(f"k = {k}" for k in RANKS)]
     tables = []
+    page: list[list[Cell]] = []
     for variant in VARIANTS:
-        rows: list[list[Cell]] = [
-            [pair, *(records.mean(_right(variant, pair, k)) for k in RANKS)] for pair in PAIRS
-        ]
-        rows.append(["views by lot", *(records.mean(_by_lot(variant, k)) for k in RANKS)])
-        ceiling = records.mean(at(variant, "ceiling"))
-        rows.append(["a right view is there", *[ceiling] * len(RANKS)])
-        tables.append(
-            Table(f"ranks_{variant}", f"Precision at rank k, {NAMES[variant]}", text, columns, rows)
-        )
-    return tables
+        of_pairs: dict[str, list[Cell]] = {
+            pair: [records.mean(_right(variant, pair, k)) for k in RANKS] for pair in PAIRS
+        }
+        lot: list[Cell] = [records.mean(_by_lot(variant, k)) for k in RANKS]
+        ceiling: list[Cell] = [records.mean(at(variant, "ceiling"))] * len(RANKS)
+        limits = [["views by lot", *lot], ["a right view is there", *ceiling]]
+        rows = [*([pair, *cells] for pair, cells in of_pairs.items()), *limits]
+        title = f"Precision at rank k, {NAMES[variant]}"
+        tables.append(Table(f"ranks_{variant}", title, text, columns, rows))
+        page += [[f"{NAMES[variant]}, {pair}", *of_pairs[pair]] for pair in SEARCHED_PAIRS]
+        if variant != "printed":  # whose views are those of the last
+            page += [[f"{NAMES[variant]}, {name}", *cells] for name, *cells in limits]
+    return [Table("ranks", "Precision at rank k", text, columns, page), *tables]
 
 
 def angle_tables(records: Records) -> list[Table]:
@@ -364,7 +379,9 @@ def angle_tables(records: Records) -> list[Table]:
         "an azimuth of 1.2° on a grid of 20° must be. Bank: the closest of all its views. Angles "
         f"of symmetric objects count in full. {records.text}"
     )
+    columns = ["depth / photograph", *POSE_COLUMNS]
     tables = []
+    page: list[list[Cell]] = []
     for variant in VARIANTS:
         rows: list[list[Cell]] = []
         for pair in PAIRS:
@@ -383,11 +400,17 @@ def angle_tables(records: Records) -> list[Table]:
                 rows.append([f"{pair}, paper", *printed.POSE_ERRORS[pair]])
         limits = [cell for k in range(4) for cell in ("-", records.mean(at(variant, "limit", k)))]
         rows.append(["bank", *limits])
-        columns = ["depth / photograph", *POSE_COLUMNS]
-        tables.append(
-            Table(f"angles_{variant}", f"Errors of the pose, {NAMES[variant]}", text, columns, rows)
-        )
-    return tables
+        title = f"Errors of the pose, {NAMES[variant]}"
+        tables.append(Table(f"angles_{variant}", title, text, columns, rows))
+        kept = ("CS/MFC", "CS/MCS", "bank")
+        shown = [row for row in rows if str(row[0]).startswith(kept)]
+        if variant != VARIANTS[-1]:  # the paper's rows stand once
+            shown = [row for row in shown if not str(row[0]).endswith("paper")]
+        if variant != "printed":
+            names = [str(row[0]) for row in shown]
+            names = [x if x.endswith("paper") else f"{NAMES[variant]}, {x}" for x in names]
+            page += [[x, *row[1:]] for x, row in zip(names, shown, strict=True)]
+    return [Table("angles", "Errors of the pose", text, columns, page), *tables]
 
 
 def search_tables(records: Records) -> list[Table]:

@@ -45,17 +45,17 @@ LAYERS: dict[str, nn.Module] = {
 """Those of photographs; of depth, nothing is kornia's."""
 
 
-def _yes() -> bool:
+def _yes(*_: object) -> bool:
     return True
 
 
-def _no() -> bool:
+def _no(*_: object) -> bool:
     return False
 
 
 @contextmanager
 def computed(*, by_kornia: bool) -> Iterator[None]:
-    """Within, filters are kornia's or sums of shifted images, traced or not."""
+    """Within, filters are kornia's or sums of shifted images, whatever the library prefers."""
     before = ops.prefers_shifts
     # one object each, by which a graph is known again
     ops.prefers_shifts = _no if by_kornia else _yes

@@ -63,7 +63,8 @@ def test_layers_are_the_same_by_both(name: str) -> None:
     assert float(large.float().mean()) < 0.002
 
 
-def test_filters_call_kornia_and_graphs_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def kornia_calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the functions of kornia that are called from now on."""
     calls: list[str] = []
     for name in ("gaussian_blur2d", "spatial_gradient"):
         own = getattr(kornia.filters, name)
@@ -73,6 +74,11 @@ def test_filters_call_kornia_and_graphs_do_not(monkeypatch: pytest.MonkeyPatch) 
             return own(*args, **options)
 
         monkeypatch.setattr(kornia.filters, name, counted)
+    return calls
+
+
+def test_filters_call_kornia_and_graphs_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = kornia_calls(monkeypatch)
     x = torch.rand(1, 1, 16, 16)
     field = filters.image_gradient(x)
     assert calls == ["gaussian_blur2d", "spatial_gradient"]
@@ -83,6 +89,21 @@ def test_filters_call_kornia_and_graphs_do_not(monkeypatch: pytest.MonkeyPatch) 
     graph = torch.compile(filters.image_gradient, fullgraph=True, backend="eager")
     torch.testing.assert_close(graph(x), field)
     assert not calls
+
+
+def test_kornia_is_not_called_where_gradients_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU: convolutions of one channel have slow gradients."""
+    calls = kornia_calls(monkeypatch)
+    x = torch.rand(1, 1, 16, 16)
+    field = filters.image_gradient(x)
+    learnable = filters.ImageGradient(learnable=True)
+    calls.clear()
+    torch.testing.assert_close(filters.image_gradient(x.clone().requires_grad_()), field)
+    torch.testing.assert_close(learnable(x), field)
+    assert not calls
+    with torch.no_grad():
+        torch.testing.assert_close(learnable(x), field)
+    assert calls == ["gaussian_blur2d", "spatial_gradient"]
 
 
 def test_grey_levels_are_those_of_kornia_in_graphs_too() -> None:
