@@ -1,6 +1,6 @@
 """Compare whole layers and commands by kornia's filters with the same by sums of shifted images.
 
-    python scripts/speed/kornia_layers.py                      # eager: layers, a new photograph
+    python scripts/speed/kornia_layers.py                      # eager: layers, a bank, photographs
     python scripts/speed/kornia_layers.py --compiled           # layers in graphs of torch.compile
 
 Writes scripts/results/kornia_layers.json and the tables of docs/kornia.md after each measurement;
@@ -29,7 +29,7 @@ from scripts.speed.timing import backward, forward, least_times
 
 BATCH = 8
 SIZE = 256
-LIMITS = {"eager": 2.5, "compiled": 1.5, "photograph": 1.05}
+LIMITS = {"eager": 2.5, "compiled": 1.5, "bank": 1.15, "photograph": 1.05}
 """Of kornia's time to that of shifted images, up to which kornia's function is used."""
 
 OUT = _shared.RESULTS / "kornia_layers.json"
@@ -122,7 +122,18 @@ def measure_photograph(preset: str, rounds: int) -> dict[str, Any]:
     calls = [functools.partial(chosen, register, by_kornia) for by_kornia in (False, True)]
     poses = [call()[0].rotation for call in calls]
     apart = float(cr.rotation_error(poses[0].double(), poses[1].double()))
-    return {"degrees": round(apart, 5), "photograph": paired(calls, rounds, 0.0)}
+    return {"kind": "photograph", "degrees": round(apart, 5), "times": paired(calls, rounds, 0.0)}
+
+
+def measure_bank(preset: str, rounds: int) -> dict[str, Any]:
+    """The views of an upright object."""
+    pipeline = PRESETS[preset].with_pose_prior("upright")
+    build = functools.partial(cr.ViewBank.build, pipeline=pipeline, progress=False)
+    mesh = cr.synthetic.example_mesh()
+    calls = [functools.partial(chosen, build, by_kornia, mesh) for by_kornia in (False, True)]
+    ours, theirs = (call().descriptors for call in calls)
+    apart = float((ours - theirs).abs().max())
+    return {"kind": "bank", "difference": apart, "times": paired(calls, rounds, 0.0)}
 
 
 def table(record: dict[str, Any]) -> list[str]:
@@ -142,7 +153,7 @@ def table(record: dict[str, Any]) -> list[str]:
         return _shared.table_lines(rows)
     commands = [["command", "shifted images", "kornia", "ratio"]]
     for name, entry in record["commands"].items():
-        times = entry["photograph"]
+        times = entry["times"]
         seconds = (f"{times[f'{kind}_ms'] / 1e3:.2f} s" for kind in ("shifts", "kornia"))
         commands.append([name, *seconds, f"{times['ratio']:.2f}"])
     return [*_shared.table_lines(rows), "", *_shared.table_lines(commands)]
@@ -180,6 +191,10 @@ def main() -> None:
                 "commands",
                 functools.partial(measure_photograph, preset, options.rounds),
             )
+        measures["bank of an upright object"] = (
+            "commands",
+            functools.partial(measure_bank, "learned", options.rounds),
+        )
     for name, (place, measure) in measures.items():
         if options.only is None or name in options.only:
             record[place][name] = measure()

@@ -222,6 +222,18 @@ def test_multiscale_focus_curves_rank_edges_by_sharpness() -> None:
     assert float(1 / focus[90]) == pytest.approx(math.sqrt(9 + 1), rel=0.03)
 
 
+def test_multiscale_focus_curves_leave_weak_edges_out() -> None:
+    """CS is a square: of the strongest edge's contrast, a tenth gives .01 and a quarter .06."""
+    x, _ = grid(161)
+    strong, quarter, tenth = (torch.erf((x - c) / (2.0 * math.sqrt(2.0))) for c in (-50.0, 0, 50.0))
+    image = (0.5 + 0.3 * strong + 0.075 * quarter + 0.03 * tenth)[None, None]
+    default = filters.multiscale_focus_curves(image)[0, :, 80].norm(dim=0)
+    every = filters.multiscale_focus_curves(image, threshold=0.001)[0, :, 80].norm(dim=0)
+    assert [bool(default[i] > 0) for i in (30, 80, 130)] == [True, True, False]
+    assert bool((every[[30, 80, 130]] > 0).all())
+    torch.testing.assert_close(default[[30, 80]], every[[30, 80]])
+
+
 def test_principal_curvature_image_of_a_dark_line() -> None:
     x, _ = grid(65)
     bright = torch.exp(-0.5 * (x / 2.0) ** 2)[None, None]

@@ -124,7 +124,7 @@ def test_the_page_shows_the_record_which_is_within_the_limits() -> None:
     for entry in record["eager"].values():
         assert entry["forward"]["ratio"] <= LIMITS["eager"]
     for entry in record["commands"].values():
-        assert entry["photograph"]["ratio"] <= LIMITS["photograph"]
+        assert entry["times"]["ratio"] <= LIMITS[entry["kind"]]
 
 
 def test_measurements_run_and_those_not_repeated_stay(
