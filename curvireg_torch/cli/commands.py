@@ -73,13 +73,12 @@ def build_bank(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
     load_libraries()
     from ..jobs.outputs import check_output_file
-
-    check_output_file(arguments.out, input_files(arguments, arguments.mesh), mark=b"curvireg")
     from ..matching import ViewBank
     from ..utils.threads import one_torch_thread
 
     start = time.perf_counter()
     options = register_options(arguments)
+    check_output_file(arguments.out, input_files(arguments, arguments.mesh), mark=b"curvireg")
     pipeline = options.open_pipeline()
     mesh = options.load_mesh(arguments.mesh)
     settings: dict[str, Any] = {
@@ -290,19 +289,18 @@ def draw(arguments: argparse.Namespace) -> None:
             f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}"
         )
     load_libraries()
-    from ..jobs.outputs import check_output_file
-
-    check_output_file(
-        arguments.out, input_files(arguments, arguments.photo, arguments.mesh), mark=b"curvireg"
-    )
     from ..data import read_photo
     from ..jobs.entry import entry_of, observe
     from ..jobs.opening import open_registrar
+    from ..jobs.outputs import check_output_file
     from ..jobs.photograph import register_observation
     from ..utils.threads import one_torch_thread
     from ..visualization import plots
 
     options = register_options(arguments, [arguments.photo], [arguments.mesh])
+    check_output_file(
+        arguments.out, input_files(arguments, arguments.photo, arguments.mesh), mark=b"curvireg"
+    )
     photo = read_photo(arguments.photo)
     with one_torch_thread():
         registrar = open_registrar(options, options.meshes)
@@ -351,11 +349,11 @@ def demo(arguments: argparse.Namespace) -> None:
     from ..visualization.encoding import png, to_uint8
     from .register import opened_registrar, print_result
 
+    options = register_options(arguments, [out / "photo.png"], [out / "mesh.ply"])
     with one_torch_thread(), output_folder(out, "demo", inputs=input_files(arguments)):
         scene = demo_scene(arguments.seed)
         write_file(out / "mesh.ply", scene.mesh.export(file_type="ply"))
         write_file(out / "photo.png", png(to_uint8(scene.image)))
-        options = register_options(arguments, [out / "photo.png"], [out / "mesh.ply"])
         options = replace(
             options, box=tuple(scene.box.tolist()), camera=Camera(scene.camera_matrix)
         )

@@ -94,7 +94,8 @@ def add_workers(parser: Any, what: str) -> None:
 def register_options(
     arguments: argparse.Namespace, photos: Sequence[Path] = (), meshes: Sequence[Path] = ()
 ) -> RegisterOptions:
-    """The options of a command; those that it lacks have their defaults."""
+    """The options of a command; those that it lacks have their defaults. The files that they name
+    are read: a mistake in one comes before a folder is made, or what it held is removed."""
     from ..utils.checks import check_device
 
     given = {
@@ -114,7 +115,9 @@ def register_options(
     check_camera(given.get("camera"), given.get("guess"))
     check_device(given.get("device", "cpu"), "--device")
     common: dict[str, Any] = {"photos": tuple(photos), "meshes": tuple(meshes), "limits": limits}
-    return RegisterOptions(**common, unit_is_given="unit" in given, **given)
+    options = RegisterOptions(**common, unit_is_given="unit" in given, **given)
+    options.open_files()
+    return options
 
 
 def input_files(arguments: argparse.Namespace, *more: Path) -> list[Path]:

@@ -262,6 +262,12 @@ class RegisterOptions:
     device: str = _option("cpu", "device of modules, bank and search (default: cpu)")
     progress: bool = _option(True, "no progress bars", flag="--quiet", action="store_false")
 
+    def open_files(self) -> None:
+        """Read the files that options name, so that a mistake in one is found before any work."""
+        self.open_pipeline()
+        self.read_start()
+        _ = self.network, self._box_file
+
     @property
     def bank_decides(self) -> bool:
         """Whether the pipeline of a bank file applies, as none was chosen."""

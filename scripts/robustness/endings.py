@@ -2,15 +2,16 @@
 
     python scripts/robustness/endings.py [--count 30] [--seed 0]
 
-Each run of ``curvireg register --list``, with and without workers in turn, gets SIGKILL, SIGTERM,
-SIGINT or SIGHUP at a random moment. Then no process of its session may be left, and whoever reads
-its output must come to the end. The next run goes on in the same folder; one that comes to its end
-must have each row once, in the order of the list and with the same poses as an undisturbed run, and
-the next begins anew. The record is scripts/results/endings.json; exit code 1 if anything failed.
-Linux.
+Each run of ``curvireg register --list``, with and without workers, gets SIGKILL, SIGTERM, SIGINT or
+SIGHUP at a random moment before its first row is on disk, between two rows, or after the last one.
+Then no process of its session may be left, and whoever reads its output must come to the end. The
+next run goes on in the same folder; once all rows are there, one that is not disturbed must have
+each row once, in the order of the list and with the poses of an undisturbed run, and the next
+begins anew. The record is scripts/results/endings.json; exit code 1 if anything failed. Linux.
 """
 
 import argparse
+import itertools
 import json
 import os
 import random
@@ -19,8 +20,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from curvireg_torch import ViewBank, sample_views
 from curvireg_torch.synthetic import demo_scene
@@ -28,9 +30,10 @@ from curvireg_torch.visualization.encoding import png, to_uint8
 from scripts._shared import RESULTS, commit, today, write_json
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+PHASES = ("before", "between", "after")  # rows
 PHOTOGRAPHS = 12
 SECONDS_TO_END = 60.0  # after a signal, on a busy machine
-SECONDS_OF_A_RUN = 600.0
+ROUNDING = 1e-5  # of rotations in blocks of other sizes
 
 
 def write_list(folder: Path) -> list[str]:
@@ -57,9 +60,17 @@ def rows_of(out: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines if line.endswith(b"\n")]
 
 
-def poses(out: Path) -> list[Any]:
-    """Photograph and pose of each row of a run that came to its end."""
-    return [(row["columns"]["photo"], row["rotation"]) for row in rows_of(out)]
+def agree(out: Path, other: Path) -> bool:
+    """Whether two finished runs have the same photographs in the same order, and the same poses."""
+    rows = rows_of(out)
+    others = rows_of(other)
+    names = [[row["columns"]["photo"] for row in some] for some in (rows, others)]
+    if names[0] != names[1]:
+        return False
+    values = [
+        [v for row in some for line in row["rotation"] for v in line] for some in (rows, others)
+    ]
+    return all(abs(a - b) < ROUNDING for a, b in zip(*values, strict=True))
 
 
 def processes_of(session: int) -> list[str]:
@@ -75,33 +86,77 @@ def processes_of(session: int) -> list[str]:
     return found
 
 
-def run(words: list[str], number: int | None, seconds: float) -> tuple[int, float, str]:
-    """Run a command, which gets a signal after ``seconds`` if it has not ended; returns its code,
-    its seconds, and what is wrong with its end."""
+class Moment(NamedTuple):
+    """When a run gets its signal: so many seconds after its folder has so many rows."""
+
+    rows: int
+    seconds: float
+
+
+class Ended(NamedTuple):
+    """A run: its code, the phase in which it got its signal, if it did, and what was wrong with its
+    end; the seconds until its first row, its last one, and its end."""
+
+    code: int
+    phase: str
+    wrong: str
+    seconds: tuple[float, float, float]
+
+
+def run(words: list[str], out: Path, number: int = 0, moment: Moment | None = None) -> Ended:
+    """Run a command, which gets a signal at a moment, if it has not ended before."""
+    known = len(rows_of(out))
+    path = out / "results.jsonl"
     begun = time.monotonic()
     process = subprocess.Popen(
-        [sys.executable, "-m", "curvireg_torch", *words],
+        [sys.executable, "-m", "curvireg_torch", *words, "--out", str(out)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         start_new_session=True,
     )
+    first = last = reached = 0.0
+    phase = ""
+    while process.poll() is None:
+        now = time.monotonic()
+        count = path.read_bytes().count(b"\n") if path.exists() else 0
+        if count > known and not first:
+            first = now - begun
+        if count == PHOTOGRAPHS and not last:
+            last = now - begun
+        if moment is not None and count >= moment.rows and not reached:
+            reached = now
+        if moment is not None and reached and now >= reached + moment.seconds:
+            process.send_signal(number)
+            phase = "before" if count == known else "after" if count == PHOTOGRAPHS else "between"
+            break
+        time.sleep(0.005)
     try:
-        printed, _ = process.communicate(timeout=seconds)
+        printed, _ = process.communicate(timeout=SECONDS_TO_END)
     except subprocess.TimeoutExpired:
-        process.send_signal(number or signal.SIGKILL)
-        try:
-            printed, _ = process.communicate(timeout=SECONDS_TO_END)
-        except subprocess.TimeoutExpired:
-            left = processes_of(process.pid)
-            os.killpg(process.pid, signal.SIGKILL)
-            return 0, time.monotonic() - begun, f"its pipe stays open: {left}"
+        left = processes_of(process.pid)
+        os.killpg(process.pid, signal.SIGKILL)
+        return Ended(-1, phase, f"its pipe stays open: {left}", (first, last, 0.0))
     ended = time.monotonic()
     while (left := processes_of(process.pid)) and time.monotonic() < ended + SECONDS_TO_END:
         time.sleep(0.1)
     wrong = f"left behind: {left}" if left else ""
     if b"Traceback" in printed:
         wrong = printed.decode(errors="replace")[-2000:]
-    return process.returncode, ended - begun, wrong
+    return Ended(process.returncode, phase, wrong, (first, last, ended - begun))
+
+
+def moment_in(
+    phase: str, known: int, took: tuple[float, float, float], chance: random.Random
+) -> Moment:
+    """A random moment of a run that begins with so many rows; ``took`` are the seconds of an
+    undisturbed one."""
+    first, last, end = took
+    if phase == "before":
+        return Moment(0, chance.uniform(0.0, first))
+    if phase == "after":
+        return Moment(PHOTOGRAPHS, chance.uniform(0.0, end - last))
+    row = (last - first) / PHOTOGRAPHS
+    return Moment(chance.randint(known + 1, PHOTOGRAPHS - 1), chance.uniform(0.0, row))
 
 
 def main() -> None:
@@ -109,44 +164,48 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=30, help="signals (default: 30)")
     parser.add_argument("--seed", type=int, default=0, help="of the moments (default: 0)")
     arguments = parser.parse_args()
-    moments = random.Random(arguments.seed)
+    chance = random.Random(arguments.seed)
+    kinds = list(itertools.product(PHASES, SIGNALS, (1, 2)))
+    chance.shuffle(kinds)
     failures: list[str] = []
-    tally = {"signals": 0, "ended_before": 0, "completed": 0}
+    phases: Counter[str] = Counter()
+    completed = 0
     with tempfile.TemporaryDirectory() as folder:
         words = write_list(Path(folder))
-        out = Path(folder, "undisturbed")
-        code, seconds, wrong = run([*words, "--out", str(out)], None, SECONDS_OF_A_RUN)
-        assert (code, wrong) == (0, ""), (code, wrong)
-        expected = poses(out)
-        took = {1: seconds, 2: seconds}
-        count = 0
+        commands = {jobs: [*words, "--jobs", str(jobs)] for jobs in (1, 2)}
+        undisturbed = {jobs: Path(folder, f"undisturbed-{jobs}") for jobs in (1, 2)}
+        run(words, Path(folder, "warm"))  # files are in the memory of the system from now on
+        took = {}
+        for jobs, command in commands.items():
+            done = run(command, undisturbed[jobs])
+            assert (done.code, done.wrong) == (0, ""), done
+            took[jobs] = done.seconds
+        assert agree(undisturbed[2], undisturbed[1]), "other rows by workers"
         out = Path(folder, "0")
-        while tally["signals"] < arguments.count:
-            jobs = 1 + count % 2
-            number = SIGNALS[count // 2 % len(SIGNALS)]
-            count += 1
+        for count, (phase, number, jobs) in enumerate(itertools.cycle(kinds)):
             known = {row["key"] for row in rows_of(out)}
-            moment = moments.uniform(0.0, took[jobs])
-            command = [*words, "--jobs", str(jobs), "--out", str(out)]
-            code, seconds, wrong = run(command, number, moment)
-            label = f"{number.name} after {moment:.1f} s, --jobs {jobs}"
+            done = run(
+                commands[jobs], out, number, moment_in(phase, len(known), took[jobs], chance)
+            )
+            reached = done.phase if done.code else "ended before"
+            label = f"{number.name} {reached}, --jobs {jobs}"
             keys = [row["key"] for row in rows_of(out)]
             lost = known - {*keys}
-            if wrong or lost or len(keys) != len({*keys}):
-                failures.append(f"{label}: code {code}, {len(lost)} rows lost; {wrong}")
-            print(f"{label}: code {code}, {len(keys)} rows {wrong}", flush=True)
-            if code == 0:
-                tally["ended_before"] += 1
-                took[jobs] = max(took[jobs], 1.5 * seconds)
-            else:
-                tally["signals"] += 1
-            if code == 0 or tally["signals"] == arguments.count or len(keys) == PHOTOGRAPHS:
-                code, _, wrong = run([*words, "--out", str(out)], None, SECONDS_OF_A_RUN)
-                tally["completed"] += 1
-                if (code, wrong) != (0, "") or poses(out) != expected:
-                    failures.append(f"{label}, then to the end: code {code}; other rows; {wrong}")
-                out = Path(folder, str(count))
-    record = {"date": today(), "commit": commit(), **vars(arguments), **tally, "failures": failures}
+            if done.wrong or lost or len(keys) != len({*keys}):
+                failures.append(f"{label}: code {done.code}, {len(lost)} rows lost; {done.wrong}")
+            print(f"{label}: code {done.code}, {len(keys)} rows {done.wrong}", flush=True)
+            phases[reached] += 1
+            signals = sum(phases[name] for name in PHASES)
+            if len(keys) >= PHOTOGRAPHS - 1 or signals == arguments.count:
+                done = run(words, out)
+                completed += 1
+                if (done.code, done.wrong) != (0, "") or not agree(out, undisturbed[1]):
+                    failures.append(f"{label}, then to the end: {done}; other rows?")
+                out = Path(folder, str(count + 1))
+            if signals == arguments.count:
+                break
+    tally = {"signals": signals, **phases, "completed": completed, "failures": failures}
+    record = {"date": today(), "commit": commit(), **vars(arguments), **tally}
     write_json(RESULTS / "endings.json", record)
     print(json.dumps(record, indent=2))
     sys.exit(bool(failures))

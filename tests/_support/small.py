@@ -2,7 +2,8 @@
 bank.
 
 ``CURVIREG_TEST_KILL=n`` kills the process with signal 9 in its n-th write of a result, whose last
-bytes are lost.
+bytes are lost. ``CURVIREG_TEST_KILL_WORKER=FILE`` so kills a worker with its first photographs,
+once: FILE is made.
 """
 
 import os
@@ -12,6 +13,7 @@ from pathlib import Path
 
 from curvireg_torch.cli import main
 from curvireg_torch.evaluation import evaluate
+from curvireg_torch.jobs import runner
 from curvireg_torch.pipeline import DEFAULT, PRESETS, BankSettings, Pipeline, ViewPolicy
 from tests._support.lists import lines
 
@@ -51,8 +53,26 @@ def kill_in_write(count: int) -> None:
     os.fsync = sync_or_die
 
 
+def kill_a_worker(marker: Path) -> None:
+    """Kill this process, a worker, when it gets photographs, unless another one did so."""
+    register = runner._register_block
+
+    def register_or_die(opened, tasks):
+        try:
+            marker.touch(exist_ok=False)
+        except FileExistsError:
+            return register(opened, tasks)
+        os.kill(os.getpid(), signal.SIGKILL)
+        raise AssertionError
+
+    runner._register_block = register_or_die
+
+
 if __name__ in ("__main__", "__mp_main__"):  # the second is that of its workers
     PRESETS[DEFAULT] = SMALL
+
+if __name__ == "__mp_main__" and "CURVIREG_TEST_KILL_WORKER" in os.environ:
+    kill_a_worker(Path(os.environ["CURVIREG_TEST_KILL_WORKER"]))
 
 if __name__ == "__main__":
     if "CURVIREG_TEST_KILL" in os.environ:

@@ -8,7 +8,7 @@ import pytest
 
 from curvireg_torch.cli import main
 from curvireg_torch.formats.exports.ros import FILES
-from curvireg_torch.jobs.outputs import MARKER
+from curvireg_torch.jobs.outputs import MARKER, output_folder
 from tests._support.lists import CAMERA, box_of, lines, table, written
 from tests._support.scenes import scene
 
@@ -122,6 +122,43 @@ def test_register_overwrites_no_input(folder, register, refused, tmp_path, capsy
     before[listed] = listed.read_bytes()
     refused(register("--list", listed, words[0]), "results.csv: an input of this command")
     assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+WRONG = {
+    "register": ("--pipeline", "--start", "--boxes", "--camera", "--field"),
+    "register several": ("--pipeline", "--boxes"),
+    "follow": ("--pipeline", "--start", "--boxes", "--field"),
+    "inspect": ("--pipeline",),
+    "demo": ("--pipeline",),
+}
+
+
+@pytest.mark.parametrize(
+    ("command", "option"), [(command, option) for command, some in WRONG.items() for option in some]
+)
+def test_a_mistake_in_an_option_makes_and_empties_no_folder(
+    folder, refused, tmp_path, command, option
+):
+    mesh = [folder / "truck.safetensors"]
+    photos = [folder / "photos" / f"{seed}.png" for seed in (0, 1)]
+    given = {
+        "register": ["register", *photos[:1], *mesh],
+        "register several": ["register", *photos, *mesh],
+        "follow": ["follow", folder / "photos", *mesh],
+        "inspect": ["inspect", folder / "truck.ply"],
+        "demo": ["demo"],
+    }
+    camera = ["--camera", *CAMERA] if option in ("--start", "--boxes") else []
+    out = tmp_path / "out"
+    words = [*given[command], *camera, option, tmp_path / "none.json", "--out", out, "--quiet"]
+    refused(main([*map(str, words)]), "none.json")
+    assert not out.exists()
+    name = "results.csv" if command in ("register several", "follow") else "inspect.json"
+    name = "result.json" if command in ("register", "demo") else name
+    with output_folder(out, command):
+        (out / name).write_text("an earlier result")
+    refused(main([*map(str, words)]), "none.json")
+    assert (out / name).read_text() == "an earlier result"
 
 
 def test_a_second_list_does_not_remove_the_rows_of_the_first(folder, register, refused, tmp_path):
