@@ -95,7 +95,7 @@ def register_options(
     arguments: argparse.Namespace, photos: Sequence[Path] = (), meshes: Sequence[Path] = ()
 ) -> RegisterOptions:
     """The options of a command; those that it lacks have their defaults. The files that they name
-    are read: a mistake in one comes before a folder is made, or what it held is removed."""
+    are read: a mistake in one is found before any work."""
     from ..utils.checks import check_device
 
     given = {

@@ -231,17 +231,16 @@ def complete(arguments: argparse.Namespace) -> str | None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
+    if arguments.views is not None or (
+        arguments.list is None and is_one_photograph(arguments.photos)
+    ):
+        with _one_result(arguments):
+            reliable = _register_alone(arguments)
+        return NONE_RELIABLE if arguments.strict and not reliable else 0
     options = _checked_options(arguments)
     from ..utils.executors import opened_workers
     from ..utils.threads import one_torch_thread
 
-    if arguments.views is not None or (
-        arguments.list is None and is_one_photograph(arguments.photos)
-    ):
-        register = _register_one if arguments.views is None else _register_rig
-        with _one_result(arguments), one_torch_thread():
-            reliable = register(options, arguments)
-        return NONE_RELIABLE if arguments.strict and not reliable else 0
     with (
         one_torch_thread(),
         _output(arguments) as out,
@@ -272,12 +271,22 @@ def _enough(arguments: argparse.Namespace) -> tuple[str, ...]:
 
 
 def _checked_options(arguments: argparse.Namespace) -> "RegisterOptions":
-    """The options; errors in them come before any photograph is read, and any folder is made."""
+    """The options; errors in them come before any photograph is read."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
     if arguments.list is not None and arguments.progress:  # a long one takes seconds
         print(f"{arguments.list}: reading", file=sys.stderr, flush=True)
     load_libraries()
     return register_options(arguments, arguments.photos, arguments.meshes)
+
+
+def _register_alone(arguments: argparse.Namespace) -> bool:
+    """Register one photograph or rig; returns whether the result is reliable."""
+    options = _checked_options(arguments)
+    from ..utils.threads import one_torch_thread
+
+    with one_torch_thread():
+        register = _register_one if arguments.views is None else _register_rig
+        return register(options, arguments)
 
 
 def _strict_code(reliable: int, failed: int) -> int:

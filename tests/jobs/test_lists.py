@@ -12,9 +12,10 @@ import torch
 
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
+from curvireg_torch.data.poses import PoseFile
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.jobs import lists, photograph, runner
-from curvireg_torch.jobs.entry import Entry, camera_of, observe
+from curvireg_torch.jobs.entry import Entry, camera_of, observe, start_in_unit
 from curvireg_torch.jobs.lists import find_photographs, list_photographs, read_list
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.pipeline import PRESETS
@@ -210,6 +211,34 @@ def test_the_camera_of_a_row_comes_before_the_guess_for_all(tmp_path):
     assert second.camera == 50.0
 
 
+def test_limits_of_a_row_come_before_those_for_all(tmp_path):
+    path = tmp_path / "list.csv"
+    path.write_text("photo,x0,y0,x1,y1,azimuth\na.png,1,2,30,40,140 220\nb.png,1,2,30,40,\n")
+    limits = {"azimuth": (0.0, 20.0), "elevation": (10.0, 30.0)}
+    options = RegisterOptions(meshes=(tmp_path / "part.stl",), limits=limits)
+    first, second = (entry.prior for entry in read_list(path, options))
+    assert (first.azimuth, second.azimuth) == ((140.0, 220.0), (0.0, 20.0))
+    assert first.elevation == second.elevation == (10.0, 30.0)
+
+
+def test_the_page_of_a_list_begins_with_the_surest_answers(tmp_path, monkeypatch):
+    pose = {"rotation": torch.eye(3).tolist(), "translation": None, "warnings": [], "message": ""}
+    pose |= {"digests": {"request": "r", "photo": "p"}}
+    rows = {
+        "unlikely": {**pose, "verdict": "unsure", "confidence": 0.1, "reliable": False},
+        "failed": {**pose, "verdict": "failed", "message": "no such file"},
+        "likely": {**pose, "verdict": "unsure", "confidence": 0.95, "reliable": False},
+        "sure": {**pose, "verdict": "reliable", "confidence": 0.92, "reliable": True},
+        "surer": {**pose, "verdict": "reliable", "confidence": 0.99, "reliable": True},
+    }
+    shown = []
+    monkeypatch.setattr(lists, "write_sheet", lambda _, __, entries, **___: shown.extend(entries))
+    entries = [Entry({"photo": name}, name, label=name) for name in rows]
+    lists._write_tables(entries, tmp_path, Mock(read=rows.get))
+    in_order = [one.name for one in sorted(shown, key=lambda one: one.rank)]
+    assert in_order == ["surer", "sure", "likely", "unlikely", "failed"]
+
+
 def test_names_are_in_the_order_of_their_numbers(tmp_path):
     names = [
         "b.png",
@@ -298,6 +327,18 @@ def test_a_long_list_makes_no_tensor_for_each_row(tmp_path, monkeypatch):
     entries = read_list(path, RegisterOptions(meshes=(tmp_path / "part.stl",)))
     assert [entry.error for entry in entries] == [""] * 3
     assert len({entry.key for entry in entries}) == 1
+
+
+@pytest.mark.parametrize(
+    ("unit", "of_mesh", "factor"), [("mm", None, 1e-3), ("mm", "cm", 0.1), (None, "mm", 1.0)]
+)
+def test_a_start_pose_is_in_the_unit_of_the_mesh(unit, of_mesh, factor):
+    """A mesh without a unit is in m; a pose without one is in that of the mesh."""
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, 3] = torch.tensor([20.0, -10.0, 600.0])
+    moved = torch.tensor(start_in_unit(PoseFile(T, unit=unit), of_mesh), dtype=torch.float64)
+    torch.testing.assert_close(moved[:3, 3], factor * T[:3, 3])
+    assert torch.equal(moved[:3, :3], T[:3, :3])
 
 
 def test_numbers_that_are_no_camera_are_the_error_of_their_row(entry):

@@ -3,14 +3,14 @@
 import weakref
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import pytest
 import torch
 
 from curvireg_torch import Camera, PosePrior
 from curvireg_torch.data.poses import PoseFile
-from curvireg_torch.errors import MeshError, WorkerError
+from curvireg_torch.errors import InvalidInputError, MeshError, WorkerError
 from curvireg_torch.jobs import runner
 from curvireg_torch.jobs.entry import Entry
 from curvireg_torch.jobs.runner import run_entries
@@ -203,6 +203,24 @@ def test_a_photograph_that_ends_its_worker_fails_and_is_tried_again(entries, tmp
     row = registered.store.read("1a")
     assert (row["verdict"], row["message"]) == ("failed", "workers: a process ended")
     assert registered(entries, tmp_path / "out") == ["1a"]
+
+
+def test_the_first_of_a_block_pays_for_the_bank(monkeypatch):
+    monkeypatch.setattr(Entry, "read", Mock())
+    monkeypatch.setattr(runner, "observe", Mock(side_effect=InvalidInputError("an empty box")))
+    rows = runner._rows([Entry(), Entry()], Mock(), bank_seconds=2.0)
+    assert [row["seconds"]["bank"] for row, _ in rows] == [2.0, 0.0]
+
+
+def test_a_missing_photograph_beside_others_is_tried_again(entries, tmp_path):
+    """Of several photographs of one pose."""
+    gone = View("gone.png", tmp_path / "gone.png", None, CAMERA, torch.eye(4))
+    rig = [replace(entries[0], views=(gone,)), replace(entries[2], views=(gone,))]
+    assert registered(rig, tmp_path / "out") == ["0a", "1a"]
+    assert registered(rig, tmp_path / "out") == ["0a", "1a"]
+    gone.photo.write_text("found again")
+    assert registered(rig, tmp_path / "out") == ["0a", "1a"]
+    assert registered(rig, tmp_path / "out") == []
 
 
 CAMERA = Camera(torch.eye(3))

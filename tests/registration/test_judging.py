@@ -167,6 +167,17 @@ def test_views_up_to_symmetries_are_near():
     assert both == pytest.approx((1.0 + 0.25**4) / (1.0 + 0.5**4 + 0.25**4))
 
 
+@pytest.mark.parametrize("siblings", [[False, True], [True, False]])
+def test_siblings_are_rivals_though_the_shape_looks_the_same(siblings):
+    """A small feature of the mesh tells them apart; without one, both are one answer."""
+    evidence = evidence_of(similarity=[0.6, 0.5])
+    poses = poses_at(0.0, 180.0)
+    two = torch.stack([torch.eye(4), HALF_TURN])
+    assert judgement(poses, evidence, symmetries=two).probabilities[1] == 0.0
+    told = replace(poses, is_sibling=torch.tensor(siblings))
+    assert judgement(told, evidence, symmetries=two).probabilities[1] > 0.0
+
+
 def test_doubts_are_those_of_the_best_pose():
     poses = poses_at(0.0, 90.0)
     known = torch.diag(torch.tensor([0.01, 0.04, 0.09, 1.0, 1.0, 1.0], dtype=torch.float64))

@@ -240,6 +240,19 @@ def test_starting_again_forgets_what_was_seen(monkeypatch):
     assert isinstance(follow._regions, RegionModel)
 
 
+def test_a_turn_goes_on_about_the_axes_of_the_camera():
+    """From A to B it is B A^T, and so B A^T B comes next."""
+    before = pose([0.3, 0.0, 0.0], [0.0, 0.0, 5.0])[None]
+    last = pose([0.0, 0.5, 0.0], [0.0, 0.0, 5.0])[None]
+    follow: Any = SimpleNamespace(
+        _poses=[before, last], last_pose=last, centre=torch.zeros(3).double()
+    )
+    predicted, _ = Tracker.predictions(follow)
+    A = before[0, :3, :3]
+    B = last[0, :3, :3]
+    torch.testing.assert_close(predicted[0, :3, :3] @ B.T, B @ A.T)
+
+
 @pytest.mark.parametrize(("angle", "count"), [(7.9, 1), (8.1, 2)])
 def test_frames_from_other_directions_are_kept(monkeypatch, angle, count):
     monkeypatch.setattr(tracker, "surface_corners", lambda *_, **__: (None, None))

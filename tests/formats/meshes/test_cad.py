@@ -363,6 +363,11 @@ def test_threemf_reads_colours_and_textures(tmp_path: Path, load: Load) -> None:
     colours = surface_colours(mesh)
     assert colours is not None
     assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
+    # a corner without an entry has that of the first
+    few = group + solid(1, "", 'pid="6" p1="0" p2="1"')
+    colours = surface_colours(load(threemf(tmp_path / "a.3mf", few, '<item objectid="1"/>'))[0])
+    assert colours is not None
+    assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
     pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "a.png")
     texture = (
@@ -393,6 +398,12 @@ def test_threemf_reads_colours_and_textures(tmp_path: Path, load: Load) -> None:
         "of a kind that is not read"
         in load(threemf(tmp_path / "a.3mf", other, '<item objectid="1"/>'))[1][0]
     )
+
+
+def test_an_axis_that_is_given_comes_before_that_of_the_file(tmp_path: Path) -> None:
+    path = threemf(tmp_path / "a.3mf", solid(1), '<item objectid="1"/>')
+    assert mesh_up(cr.load_mesh(path)) == "z"
+    assert mesh_up(cr.load_mesh(path, up="-y")) == "-y"
 
 
 def test_threemf_of_several_models(tmp_path: Path, load: Load) -> None:
