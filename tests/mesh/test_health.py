@@ -42,6 +42,13 @@ def box(
     return mesh
 
 
+def row_of_chips(axis: int) -> trimesh.Trimesh:
+    """A box, and a row of chips along an axis, 7 apart."""
+    places = np.zeros((5, 3))
+    places[:, axis] = 0.5 * SIDES[axis] + 7.0 * np.arange(1, 6)
+    return joined(box(), *(triangle(1.0, (x, y, z)) for x, y, z in places))
+
+
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize(
     "at", [(300.0, 0.0, 0.0), (0.0, -120.0, 0.0), (0.0, 0.0, 1e6), (80.0, 80.0, 80.0)]
@@ -74,8 +81,7 @@ def test_colours_stay_with_their_faces() -> None:
         joined(box(), box((100.0, 0.0, 0.0), (4.0, 4.0, 4.0))),  # 0.9 % of the area
         joined(box(), box((0.0, 0.0, 60.0), (0.2, 0.2, 90.0))),  # a thin mast on the top
         joined(box(), triangle(1.0, (34.0, 0.0, 0.0))),  # a chip near the surface
-        # a row of chips, 7 apart
-        joined(box(), *(triangle(1.0, (30.0 + 7.0 * k, 0.0, 0.0)) for k in range(1, 6))),
+        *(row_of_chips(axis) for axis in range(3)),
         # a knob above a plate's middle
         joined(box(sides=(60.0, 40.0, 1e-3)), triangle(2.0, (0.0, 0.0, 3.0))),
         joined(box(), box(sides=(200.0, 200.0, 200.0))),
@@ -85,7 +91,20 @@ def test_colours_stay_with_their_faces() -> None:
         triangle(1.0, (0.0, 0.0, 0.0)),
         box(sides=(1000.0, 1.0, 1.0)),
     ],
-    ids=["body", "mast", "chip", "row", "knob", "inside", "soup", "sphere", "triangle", "rod"],
+    ids=[
+        "body",
+        "mast",
+        "chip",
+        "row x",
+        "row y",
+        "row z",
+        "knob",
+        "inside",
+        "soup",
+        "sphere",
+        "triangle",
+        "rod",
+    ],
 )
 def test_parts_that_belong_to_the_object_stay(whole: trimesh.Trimesh) -> None:
     assert not stray_faces(whole).any()
