@@ -4,6 +4,7 @@ import torch
 import trimesh
 
 from curvireg_torch.mesh import mesh_symmetries
+from curvireg_torch.mesh.symmetry import feature_fractions
 from curvireg_torch.synthetic import example_mesh
 
 ROTATED = trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9]))
@@ -50,3 +51,12 @@ def test_a_handle_breaks_the_symmetry():
     handle.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
     handle.apply_translation([0.04, 0.0, 0.08])
     assert len(mesh_symmetries(trimesh.util.concatenate([BOTTLE, handle]))) == 1
+
+
+def test_a_plain_shape_has_no_feature_wherever_it_stands():
+    """Quarter turns about its own axis, far from the origin."""
+    post = trimesh.creation.box((1.0, 1.0, 3.0))
+    post.apply_translation([5.0, 1.0, 0.0])
+    symmetries = mesh_symmetries(post)
+    assert len(symmetries) == 8
+    assert float(feature_fractions(post, symmetries).max()) < 1e-3
