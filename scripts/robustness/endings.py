@@ -32,7 +32,7 @@ from scripts._shared import RESULTS, commit, today, write_json
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 PHASES = ("before", "between", "after")  # rows
 PHOTOGRAPHS = 12
-SECONDS_TO_END = 60.0  # after a signal, on a busy machine
+SECONDS_TO_END = 300.0  # after a signal, on a busy machine
 ROUNDING = 1e-5  # of rotations in blocks of other sizes
 
 
