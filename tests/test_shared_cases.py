@@ -18,8 +18,8 @@ from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputEr
 from curvireg_torch.jobs.lists import find_photographs, read_list
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.mesh import has_colours, mesh_symmetries, mesh_warnings
-from curvireg_torch.registration.inputs import FRACTIONS, image_items
-from curvireg_torch.registration.starts import why_outside
+from curvireg_torch.registration.photograph import FRACTIONS, image_items
+from curvireg_torch.registration.refinement import why_outside
 from curvireg_torch.utils.extras import is_installed
 
 from ._support.cans import can

@@ -173,8 +173,8 @@ class Tally:
 
     def doubt(self) -> str:
         """What to say once, after the first frames, if the object was not found with certainty."""
-        from ..registration.following import BELIEVED_CONFIDENCE
-        from ..registration.words import two_decimals
+        from ..registration.confidence import two_decimals
+        from ..registration.tracking import BELIEVED_CONFIDENCE
 
         if self.frames != FRAMES_TO_LOCK or self.best_confidence >= BELIEVED_CONFIDENCE:
             return ""
@@ -187,7 +187,7 @@ class Tally:
         return self.frames - self.counts["lost"] - self.counts["failed"]
 
     def __str__(self) -> str:
-        from ..registration.words import verdict_counts
+        from ..visualization.words import verdict_counts
 
         rate = ""
         if self.seconds_after_first > 0.0:
@@ -421,7 +421,7 @@ def _live(source: str) -> tuple[Iterator["Frame"], None, float]:
 def _camera_in_words(result: "Registration | FailedRegistration") -> str:
     """A camera that is not known exactly; "" of one that is, and of a frame without a pose."""
     from ..registration import FailedRegistration
-    from ..registration.words import focal_length_in_words
+    from ..visualization.words import focal_length_in_words
 
     if isinstance(result, FailedRegistration) or result.camera is None:
         return ""

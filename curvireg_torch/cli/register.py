@@ -338,7 +338,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     from ..jobs.photograph import register_observation
     from ..jobs.result_files import write_lost
     from ..mesh import mesh_up
-    from ..registration.words import camera_in_words
+    from ..visualization.words import camera_in_words
 
     out = arguments.out
     path = options.photos[0]
@@ -382,7 +382,7 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     reliable."""
     from ..jobs.result_files import write_views
     from ..jobs.rigs import read_rig, register_rig
-    from ..registration.words import view_in_words
+    from ..visualization.words import view_in_words
 
     out = arguments.out
     rig = read_rig(arguments.views, options.meshes[0])
@@ -483,9 +483,10 @@ def _register_several(
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
-    """Print a :func:`~curvireg_torch.registration.documents.result_document`; ``out`` is the folder
+    """Print a :func:`~curvireg_torch.jobs.documents.result_document`; ``out`` is the folder
     of its files."""
-    from ..registration.words import measured, remarks, two_decimals
+    from ..registration.confidence import two_decimals
+    from ..visualization.words import measured, remarks
 
     confidence = NOT_CALIBRATED
     if document["confidence"] is not None:
@@ -524,7 +525,8 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
 
 def _print_objects(document: Mapping[str, Any]) -> None:
     """Print where objects were detected, and the confidence of each if there are several."""
-    from ..registration.words import corners, two_decimals
+    from ..registration.confidence import two_decimals
+    from ..visualization.words import corners
 
     instances = document.get("detection", {}).get("instances", [])
     several = len(instances) > 1
@@ -556,8 +558,8 @@ def _angles(pose: Mapping[str, Any]) -> str:
 
 def _print_rivals(document: Mapping[str, Any]) -> None:
     """Print rivals that are nearly as probable as the best pose, if there are any."""
+    from ..registration.confidence import two_decimals
     from ..registration.result import RIVAL_FRACTION
-    from ..registration.words import two_decimals
 
     if document["ambiguous"] is None:
         return

@@ -19,7 +19,7 @@ from ..matching import cached_bank
 from ..mesh import load_mesh
 from ..pipeline import DEFAULT, PRESETS, Pipeline
 from ..registration import Registrar
-from ..registration.words import two_decimals
+from ..registration.confidence import two_decimals
 from ..utils.checks import check_positive
 from ..utils.executors import Workers
 from ..utils.files import write_file

@@ -16,7 +16,7 @@ from ..formats.masks import mask_as_shown, mask_file
 from ..geometry import Camera, camera_matrix
 from ..geometry.cameras import camera_of_view
 from ..geometry.pose_prior import PosePrior
-from ..registration.inputs import ImageItem, image_items
+from ..registration.photograph import ImageItem, image_items
 from ..utils.choices import UNITS
 from ..utils.files import file_digest, text_digest
 from ..utils.likes import BoxLike

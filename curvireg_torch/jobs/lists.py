@@ -22,11 +22,12 @@ from ..errors import (
     MissingFileError,
 )
 from ..geometry import Camera, camera_matrix
-from ..registration.words import two_decimals, verdict_counts
+from ..registration.confidence import two_decimals
 from ..utils.choices import IMAGES, VIDEOS, pattern_of
 from ..utils.executors import Workers
 from ..utils.files import FindFile, found_in, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet
+from ..visualization.words import verdict_counts
 from .entry import Entry, entry_of
 from .options import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
 from .outputs import output_folder

@@ -24,14 +24,14 @@ from ..mesh.mesh import mesh_unit
 from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.detection import detect_items
-from ..registration.documents import detection_document, result_document
 from ..registration.hypotheses import projected_box
-from ..registration.inputs import image_item
+from ..registration.photograph import image_item
 from ..registration.refinement import refine_items
 from ..registration.registrar import ObjectLike, Results
 from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
+from .documents import detection_document, result_document
 from .entry import Entry, Observation, observe, start_in_unit
 from .opening import check_bank
 from .outputs import output_folder

@@ -7,13 +7,13 @@ from typing import Any
 from torch import Tensor
 
 from ..registration import Registrar, Registration
-from ..registration.documents import SCHEMA
 from ..utils.files import write_file
 from ..utils.threads import map_on_threads
 from ..visualization import pose_glb, registration_sheet
 from ..visualization.encoding import png
 from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
+from .documents import SCHEMA
 from .store import to_json
 from .views import View
 

@@ -19,9 +19,9 @@ from ..errors import MAX_RIG_VIEWS, CurviregError, InvalidInputError, MissingFil
 from ..geometry import Camera
 from ..geometry.cameras import transform
 from ..registration import Registrar, Registration
-from ..registration.documents import result_document
 from ..utils.checks import check_pose
 from ..utils.files import FindFile, check_table_size, finite_numbers, found_in, read_csv, read_json
+from .documents import result_document
 from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, numbers_of
 from .views import View, register_views
 

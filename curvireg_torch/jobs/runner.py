@@ -22,13 +22,13 @@ from ..errors import (
 )
 from ..formats.meshes.files import mesh_digest
 from ..registration import Registrar
-from ..registration.documents import SCHEMA, line_document, places_document
 from ..registration.result import verdict_of_error
 from ..utils.executors import Workers
 from ..utils.files import file_digest, text_digest, write_file
 from ..utils.sources import package_digest
 from ..visualization.overlay import drawn_copies
 from ..visualization.sheet import thumbnail
+from .documents import SCHEMA, line_document, places_document
 from .entry import Entry, Observation, observe
 from .options import with_advice
 from .photograph import RegisteredPhotograph, register_observations

@@ -3,11 +3,10 @@ box."""
 
 from ..fitting.contour_fit import fit_contours as fit_contours
 from ..fitting.measured_fit import ContourFit as ContourFit
+from ..matching.detector import Detector as Detector
+from ..matching.detector import Proposals as Proposals
 from .confidence import RELIABLE as RELIABLE
 from .detection import detect as detect
-from .detector import Detector as Detector
-from .detector import Proposals as Proposals
-from .following import Follower as Follower
 from .refinement import refine as refine
 from .registrar import Registrar as Registrar
 from .result import Detection as Detection
@@ -16,3 +15,4 @@ from .result import Hypothesis as Hypothesis
 from .result import PhotographPose as PhotographPose
 from .result import Registration as Registration
 from .several import register_views as register_views
+from .tracking import Follower as Follower

@@ -112,7 +112,7 @@ def refinement_confidence(features: Features) -> float:
 
 def tracking_confidence(features: Features) -> float:
     """Probability that a tracked pose is within 10 degrees and 10 % of the distance of the truth,
-    if it was before, from the features of :class:`.tracker.TrackedPose`."""
+    if it was before, from the features of :class:`.TrackedPose`."""
     model = LogisticModel.named("tracking")
     return model({name: features[name] for name in model.weights})
 
@@ -275,3 +275,13 @@ def hypothesis_probabilities(any_right: float, scores: Tensor, *, exact: bool) -
         (0.45, 0.45)
     """
     return tuple((any_right * shares(scores, exact=exact)).tolist())
+
+
+def two_decimals(probability: float) -> str:
+    """A probability as it is shown, never rounded up: 0.897 is not yet 0.90, reliable.
+
+    Example:
+        >>> two_decimals(0.897), two_decimals(0.29), two_decimals(1.0)
+        ('0.89', '0.29', '1.00')
+    """
+    return f"{math.floor(100.0 * probability + 1e-9) / 100.0:.2f}"

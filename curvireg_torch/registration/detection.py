@@ -14,32 +14,22 @@ from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..geometry.crops import box_iou, non_maximum_suppression
+from ..geometry.framing import boxes_at
 from ..geometry.pose_prior import PosePrior
+from ..matching.detector import SAME_OBJECT_OVERLAP, Proposals
 from ..terms import QueryFeatures
 from ..utils.likes import CameraLike, ImagesLike
 from .block import keypoint_poses
-from .confidence import detection_probability
-from .detector import Proposals
-from .focal import usual_camera
+from .camera import limits_of, usual_camera
+from .confidence import detection_probability, two_decimals
 from .hypotheses import projected_box
-from .inputs import ImageItem, check_crop, image_items
+from .photograph import ImageItem, check_crop, image_items
 from .result import Detection, FailedRegistration, Registration
 from .stages import map_items, register
 from .target import Target
-from .tracker import boxes_at
-from .unknown_camera import limits_of
-from .words import corners, two_decimals
 
-TEMPLATE_SIDE = 96  # Side of the template views in px
-SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
-SAME_OBJECT_OVERLAP = 0.5  # Intersection over union from which boxes show the same object
-MIN_OBJECT_SIDE = 32.0  # Longer side in px of the smallest object that can be recognised
 MIN_REGISTERED = 2  # Places that are registered at least, as a fitted pose tells more than its box
 FOUND_CONFIDENCE = 0.1  # Confidence below which the object counts as not found
-MAX_PEAKS = 500  # Best peaks of a photograph that boxes are selected from
-# Largest number of views, evenly spread over the bank, whose pairwise distances are computed
-MAX_COMPARED_VIEWS = 1500
-MEDOID_ROUNDS = 10  # Largest number of rounds of k-medoids
 Results = list[Registration | FailedRegistration]
 
 
@@ -87,7 +77,7 @@ def detect(
 def detect_items(
     target: Target, items: Sequence[ImageItem | CurviregError], *, instances: int = 1
 ) -> list[Results]:
-    """:func:`detect` in photographs that :func:`.inputs.image_items` has prepared."""
+    """:func:`detect` in photographs that :func:`.image_items` has prepared."""
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
     found = map_items(
@@ -145,7 +135,8 @@ def _lost(found: Sequence[Registration], index: int) -> FailedRegistration:
     """The answer where no place is convincing: the most likely one, without its pose."""
     best = max(found, key=lambda one: one.confidence or 0.0)
     assert best.detection is not None
-    place = f"at the most likely place, box {corners(best.detection.box.tolist())}"
+    box = " ".join(f"{v:.0f}" for v in best.detection.box.tolist())
+    place = f"at the most likely place, box {box}"
     seen = f"the object is seen with a probability of {two_decimals(best.confidence or 0.0)}"
     error = LostObjectError(f"not found: {place}, {seen}; give a box", images=(index,))
     error.detection = best.detection

@@ -1,30 +1,125 @@
-"""Judgement of the fitted poses of one photograph: their order, their probabilities, and what is
-questionable."""
+"""Judgement of fitted poses: their order, their probabilities, and what is questionable.
 
-from collections.abc import Mapping
-from dataclasses import replace
+Doubts about the best pose are settled by what a symmetry of the shape makes of it, by its mirror
+image, and by the poses of other meshes.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from ..evidence import Evidence
-from .block import Block
+from ..errors import CurviregError
+from ..evidence import Evidence, EvidenceWeights
+from ..fitting.details import ContourDetails, compared, contour_details
+from ..fitting.devices import on_device
+from ..fitting.edges import EdgeCrops
+from ..geometry.cameras import transform
+from ..geometry.framing import border_sides, outside_fraction
+from ..geometry.viewpoint import rotation_error
+from ..matching import Ranking
+from ..mesh.mesh import MIRROR
+from ..mesh.reflections import reflection_plane
+from ..mesh.round_axis import RoundAxis
+from .block import Block, Described, evidence_of, fitted_poses, with_evidence
 from .confidence import (
+    MAX_MARGIN,
+    RIVAL_ANGLE,
+    ROUNDING,
     are_near,
     confidence_features,
     hypothesis_probabilities,
     is_calibrated,
     probability_of_any,
     ranking_share,
+    resolution,
+    shares,
     undetermined_axes,
 )
-from .framing import border_sides, outside_fraction, outside_warnings
-from .groups import Axis, Rivals, axis_of, pair_probability
-from .hypotheses import Hypotheses, hypothesis_of
-from .inputs import ImageItem
-from .result import Registration, ambiguity
+from .hypotheses import Hypotheses, hypothesis_of, placed, with_short_fit
+from .photograph import ImageItem
+from .result import (
+    AXIS_TOLERANCE,
+    DETERMINING_KEYPOINTS,
+    Axis,
+    FailedRegistration,
+    Registration,
+    ambiguity,
+)
 from .target import Target
 
+
+@dataclass(frozen=True)
+class Rivals:
+    """R distinct poses that compete for a photograph, the best first, and the views of the bank.
+
+    Attributes:
+        rotations: (R, 3, 3) allocentric.
+        scores: (R,) by which they are ordered.
+        margins: (R,) scores without keypoints.
+        features: :func:`.confidence_features` of the best one.
+        view_rotations: (N, 3, 3) of the bank.
+        view_scores: (N,) of the ranking.
+    """
+
+    rotations: Tensor
+    scores: Tensor
+    margins: Tensor
+    features: Mapping[str, float | None]
+    view_rotations: Tensor
+    view_scores: Tensor
+
+    def probability(self, members: Tensor, views: Tensor, *, turns: bool = False) -> float:
+        """Probability that one of the ``members`` (R,) bool, of which the best pose is one, is
+        right; ``views`` (N,) bool are those near them. ``turns``: the rotation about one axis need
+        not be determined. Poses that all agree have the largest margin."""
+        others = self.margins[~members]
+        margin = MAX_MARGIN
+        if len(others):
+            margin = float((self.margins[0] - others.max()).clamp(-MAX_MARGIN, MAX_MARGIN))
+        share = ranking_share(self.view_scores, views.to(self.view_scores.device))
+        features = {**self.features, "margin": margin, "ranking_share": share}
+        if turns:
+            undetermined = self.features["undetermined"] or 0.0
+            features["undetermined"] = max(undetermined - 1.0, 0.0)
+        any_right = probability_of_any(features, exact=True)
+        return any_right * float(shares(self.scores, exact=True)[members].sum())
+
+
+def axis_of(rivals: Rivals, axis: RoundAxis, rotation: Tensor) -> Axis:
+    """Where the ``axis`` of a mesh points at a pose's ``rotation`` (3, 3), and how probable that
+    is."""
+    same = directions_agree(rivals.rotations, axis, AXIS_TOLERANCE)
+    near = directions_agree(rivals.view_rotations, axis, RIVAL_ANGLE, reference=rivals.rotations[0])
+    direction = rotation.double() @ axis.direction
+    return Axis(direction, rivals.probability(same, near, turns=True))
+
+
+def directions_agree(
+    rotations: Tensor, axis: RoundAxis, degrees: float, *, reference: Tensor | None = None
+) -> Tensor:
+    """(N,) bool: whether the axis of a mesh at rotations (N, 3, 3) points within ``degrees`` of
+    where it does at the ``reference`` (3, 3), by default the first of them."""
+    reference = rotations[0] if reference is None else reference
+    directions = rotations.double() @ axis.direction.to(rotations.device)
+    cosine = directions @ (reference.double() @ axis.direction).to(directions)
+    if axis.ends_are_alike:
+        cosine = cosine.abs()
+    return torch.rad2deg(cosine.clamp(-1.0, 1.0).acos()) <= degrees + ROUNDING
+
+
+def pair_probability(rivals: Rivals, symmetries: Tensor | None) -> float:
+    """Probability that the best pose or its first rival is right."""
+    members = torch.zeros(len(rivals.scores), dtype=torch.bool)
+    members[:2] = True
+    near = [are_near(rivals.view_rotations, R, symmetries) for R in rivals.rotations[:2]]
+    return rivals.probability(members, near[0] | near[1])
+
+
+# Fraction of the object outside the photograph from which a result carries a warning
+MUCH_OUTSIDE = 0.1
 OUTSIDE_MARGIN = 1.0
 """Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity, or
 of the evidence of contours."""
@@ -179,3 +274,305 @@ def _contradiction(
     filling = Hypotheses.in_boxes(target.describer, boxes, cameras, *placement)
     better = gain is not None and gain > OUTSIDE_MARGIN
     return limits.contradiction(best, filling, better_outside=better)
+
+
+def outside_warnings(fraction: float) -> tuple[str, ...]:
+    """What is questionable about a photograph that does not show a ``fraction`` of the object."""
+    if fraction < MUCH_OUTSIDE:
+        return ()
+    return (
+        f"{100 * fraction:.0f} % of the object lies outside the photograph; take one that shows "
+        f"all of it",
+    )
+
+
+BETTER = 0.1  # Score by which a sibling replaces the pose: more than rounding
+
+
+@dataclass(frozen=True)
+class Siblings:
+    """K poses that symmetries of the shape make of one, the pose itself first.
+
+    Attributes:
+        poses: of them, with evidence that is measured in the same way for all, without a fit.
+        details: (K, K) :func:`.compare_details` of the row with the column.
+        look_different: (K, K) bool.
+        weights: of evidence.
+    """
+
+    poses: Hypotheses
+    details: Tensor
+    look_different: Tensor
+    weights: EvidenceWeights
+
+    def gain(self, other: int) -> Tensor:
+        """(K,) by how much siblings score more than the ``other`` one."""
+        scores = self.poses.evidence.scores(self.weights)
+        return scores - scores[other] + self.details[:, other]
+
+    def best(self) -> int:
+        """Index of the sibling with the highest score; 0 unless it is clearly higher."""
+        gain = self.gain(0)
+        best = int(gain.argmax())
+        return best if float(gain[best]) > BETTER else 0
+
+    def rival(self, best: int, fitted: Evidence, *, notable: bool) -> tuple[Hypotheses, bool]:
+        """The sibling with the highest score among those that differ from the ``best`` one in the
+        photograph, or in a ``notable`` feature of the mesh that it does not show; none if it is the
+        same pose of a symmetric mesh. And whether a small feature of the mesh tells siblings apart
+        that the photograph does not show.
+
+        Its evidence is that of the best one as it was ``fitted``, plus their difference without a
+        fit.
+        """
+        poses = self.poses
+        angle = rotation_error(poses.T[:, :3, :3], poses.T[best, :3, :3])
+        far = angle > RIVAL_ANGLE
+        different = far & self.look_different[best]
+        alike = far & ~self.look_different[best]
+        counted = far if notable else different
+        some = counted.nonzero()[:, 0]
+        chosen = some[self.gain(best)[some].argsort(descending=True)[:1]]
+        own = poses.evidence.table
+        evidence = Evidence.from_table(fitted.table + own[chosen] - own[best])
+        details = evidence.details + self.details[chosen, best]
+        rival = replace(poses[chosen], evidence=replace(evidence, details=details))
+        return rival, bool(alike.any())
+
+
+def siblings_of(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses) -> list[Siblings]:
+    """The siblings of the ``best`` pose of each photograph, by the symmetries of the shape that
+    small features tell apart, the identity first."""
+    symmetries = target.telling_symmetries.transforms
+    count = len(symmetries)
+    copies = best[torch.arange(len(best)).repeat_interleave(count)]
+    T = copies.T @ symmetries.to(copies.T).repeat(len(best), 1, 1)
+    poses = placed(copies, T, target.describer.centre)
+    given = poses.cameras, poses.T, poses.photograph
+    seen = on_device(contour_details, target.describer.device_contours, crops, *given)
+    poses = with_evidence(target, block, poses)
+    weights = target.score_weights(exact=True)
+    return [
+        Siblings(poses[rows], *compared(seen[rows]), weights=weights)
+        for rows in torch.arange(len(poses)).split(count)
+    ]
+
+
+def with_siblings(
+    target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses
+) -> tuple[Hypotheses, Hypotheses, list[bool]]:
+    """Replace the best pose of each photograph by what a symmetry of the shape makes of it, if
+    small features say so; return the poses, the strongest rival of each best one among these, and
+    for each photograph whether it hides the feature. Given symmetries are trusted."""
+    symmetries = target.telling_symmetries
+    if len(symmetries) == 1:
+        return poses, poses[:0], [False] * len(block)
+    best = poses.best(target.score_weights(exact=True))
+    siblings = siblings_of(target, block, crops, poses[best])
+    kept = [one.best() for one in siblings]
+    moved = torch.tensor([k for k, place in enumerate(kept) if place], dtype=torch.long)
+    if len(moved):
+        starts = Hypotheses.cat(
+            [siblings[k].poses[torch.tensor([kept[k]])] for k in moved.tolist()]
+        )
+        fitted = fitted_poses(target, block, crops, starts, refit=True)
+        fitted = with_evidence(target, block, fitted)
+        allowed = block.keeps(fitted)
+        poses = poses.with_poses(best[moved[allowed]], fitted[allowed])
+    pairs = [
+        one.rival(place, poses.evidence[row], notable=symmetries.notable)
+        for one, place, row in zip(siblings, kept, best.split(1), strict=True)
+    ]
+    rivals = Hypotheses.cat([rival for rival, _ in pairs])
+    rivals = replace(
+        rivals,
+        is_outside=torch.zeros_like(rivals.is_outside),
+        is_distinct=torch.ones_like(rivals.is_distinct),
+        is_sibling=torch.ones_like(rivals.is_sibling),
+    )
+    return poses, rivals[block.keeps(rivals)], [is_hidden for _, is_hidden in pairs]
+
+
+LEAST_CONFIDENCE = 0.5  # from which an answer is compared
+DOUBT = 0.3  # factor of the confidence where the mirror image fits better
+WARNING = (
+    "the mirror image of the mesh fits better than the mesh: check whether an axis of it is flipped"
+)
+
+
+def compared_with_mirror_image(
+    target: Target,
+    block: Block,
+    crops: EdgeCrops,
+    best: Hypotheses,
+    results: Sequence[Registration],
+) -> list[Registration]:
+    """Results of photographs, whose ``best`` poses are one in each. Where it is probably right and
+    the mirror image of the mesh fits better, the result gets a warning, and ``DOUBT`` of its
+    confidence."""
+    likely = torch.tensor([(result.confidence or 0.0) >= LEAST_CONFIDENCE for result in results])
+    # a print that is found is not mirrored
+    compared = (likely & (best.evidence.keypoints < DETERMINING_KEYPOINTS)).nonzero()[:, 0]
+    found = list(results)
+    if not len(compared):
+        return found
+    gain = mirror_gain(target, block, crops, best[compared])
+    for place in compared[gain > resolution(exact=True)].tolist():
+        doubted = found[place].scaled(DOUBT)
+        found[place] = replace(doubted, warnings=(*doubted.warnings, WARNING))
+    return found
+
+
+def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses) -> Tensor:
+    """(N,) by how much the mirror image of the mesh scores more in a photograph than the mesh at
+    its ``best`` pose, by shape alone and after a short fit; 0 for a mesh that is its own mirror
+    image."""
+    plane = reflection_plane(target.bank.mesh)
+    if plane is None:
+        return torch.zeros(len(best), dtype=torch.float64)
+    image = target.mirror_image
+    centre = image.describer.centre
+    starts = [
+        reflected_poses(one, plane, target.describer.centre, centre)
+        for one in (best[row] for row in torch.arange(len(best)).split(1))
+    ]
+    fitted, _ = with_short_fit(image.describer, crops, Hypotheses.cat(starts))
+    described = Described(
+        query=block.query,
+        rankings=[Ranking.none()] * len(block),
+        descriptor=block.descriptor,
+        crops=crops,
+        keypoints=[None] * len(block),
+        frames=block.frames,
+    )
+    seen = evidence_of(image, described, placed(fitted, fitted.short_fit, centre))
+    weights = target.score_weights(exact=True)
+    of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
+    highest = seen.scores(of_shape).view(len(best), -1).amax(dim=1)
+    return highest - best.evidence.scores(of_shape)
+
+
+def reflected_poses(
+    pose: Hypotheses, plane: Tensor, centre: Tensor, image_centre: Tensor
+) -> Hypotheses:
+    """Two poses at which the mirror image of a mesh is the mesh at one ``pose``, reflected through
+    planes in its ``centre`` (3,): one that faces the camera, and that with the normal ``plane``
+    (3,) in the model's frame. ``image_centre`` (3,) is the centre of the image."""
+    T = pose.T[0]
+    rotation = T[:3, :3]
+    position = rotation @ centre.to(T) + T[:3, 3]
+    normals = torch.stack([F.normalize(position, dim=0), rotation @ plane.to(T)])
+    reflections = torch.eye(3).to(T) - 2.0 * normals[:, :, None] * normals[:, None]
+    R = reflections @ rotation @ MIRROR.to(T)
+    copies = pose[torch.zeros(len(R), dtype=torch.long)]
+    return placed(copies, transform(R, position - R @ image_centre.to(T)), image_centre)
+
+
+DETAILED = 5.0
+"""Score by which a mesh may be behind the best one to be compared with it in detail."""
+
+
+def best_of_meshes(
+    results: Sequence[Registration | FailedRegistration],
+    targets: Sequence[Target],
+    item: ImageItem | None = None,
+) -> Registration | FailedRegistration:
+    """The best of the results of several meshes for one photograph, the ``item``; None for several
+    photographs together, which are not compared in detail.
+
+    The probabilities of the best one are those among the poses of all meshes;
+    ``mesh_probabilities`` has that of each mesh. Similar meshes have no scores in common: the more
+    confident one is the best, and so it is without probabilities, by the score.
+    """
+    posed = [k for k, result in enumerate(results) if isinstance(result, Registration)]
+    if not posed:
+        return results[0]
+    found = [result for result in results if isinstance(result, Registration)]
+    if len(found) == 1:
+        return replace(found[0], mesh_index=posed[0])
+    if not all(one.probabilities for one in found) or not all(t.is_exact for t in targets):
+        order = [(one.confidence or 0.0, one.score) for one in found]
+        best = order.index(max(order))
+        return replace(found[best], mesh_index=posed[best])
+    weights = targets[0].score_weights(exact=True)
+    scores = [_rival_scores(one, weights) for one in found]
+    if item is not None:
+        scores = _compared_in_detail(scores, found, [targets[k] for k in posed], item)
+    tops = torch.stack([one.max() for one in scores])
+    best = int(tops.argmax())
+    share = shares(torch.cat(scores), exact=True)
+    of_mesh = torch.stack([part.sum() for part in share.split([len(one) for one in scores])])
+    any_right = max(sum(one.probabilities) for one in found)
+    every = torch.zeros(len(results), dtype=torch.float64)
+    every[torch.tensor(posed)] = any_right * of_mesh
+    own = sum(found[best].probabilities)
+    factor = float(any_right * of_mesh[best]) / max(own, 1e-12)
+    return replace(
+        found[best].scaled(factor),
+        mesh_index=posed[best],
+        mesh_probabilities=tuple(every.tolist()),
+    )
+
+
+def _rival_scores(result: Registration, weights: EvidenceWeights) -> Tensor:
+    """(R,) scores of the poses of one mesh that have a probability, the best first."""
+    rivals = [
+        hypothesis.evidence
+        for hypothesis, probability in zip(result.hypotheses, result.probabilities, strict=True)
+        if probability > 0.0
+    ]
+    evidence = Evidence.of_hypotheses(rivals or [result.hypotheses[0].evidence])
+    return evidence.scores(weights)
+
+
+def _compared_in_detail(
+    scores: Sequence[Tensor],
+    found: Sequence[Registration],
+    targets: Sequence[Target],
+    item: ImageItem,
+) -> list[Tensor]:
+    """The scores of each mesh's poses, moved by how far the contours that only its best pose
+    predicts speak for it, beside the best mesh."""
+    first = max(range(len(scores)), key=lambda k: float(scores[k].max()))
+    behind = [float(scores[first].max() - one.max()) for one in scores]
+    if found[first].edge_support is None:
+        return list(scores)
+    chosen = [k for k, gap in enumerate(behind) if k == first or gap < DETAILED]
+    if len(chosen) == 1:
+        return list(scores)
+    try:
+        details = [_details_of(targets[k], found[k], item) for k in chosen]
+    except CurviregError:  # a box that leaves nothing to compare
+        return list(scores)
+    gain, _ = compared(joined(details))
+    place = chosen.index(first)
+    moved = list(scores)
+    for row, k in enumerate(chosen):
+        moved[k] = scores[k] + gain[row, place]
+    return moved
+
+
+def _details_of(target: Target, result: Registration, item: ImageItem) -> ContourDetails:
+    """What the contours of a mesh's best pose are compared by, in the box of the photograph that
+    was given, or in which the object was found."""
+    box = item.box if result.detection is None else result.detection.box.float()
+    crops = EdgeCrops.cut([item.image], box[None], target.bank.settings.margin)
+    T, K = result.projection
+    index = torch.zeros(1, dtype=torch.long)
+    return contour_details(target.describer.contours, crops, K[None], T[None], index)
+
+
+def joined(details: Sequence[ContourDetails]) -> ContourDetails:
+    """Details of several meshes in one table; those with fewer points get invalid ones."""
+    most = max(one.uv.shape[1] for one in details)
+
+    def filled(values: Tensor) -> Tensor:
+        missing = most - values.shape[1]
+        shape = (len(values), missing, *values.shape[2:])
+        return torch.cat([values, values.new_zeros(shape)], dim=1)
+
+    columns = {
+        field.name: torch.cat([filled(getattr(one, field.name)) for one in details])
+        for field in fields(ContourDetails)
+    }
+    return ContourDetails(**columns)

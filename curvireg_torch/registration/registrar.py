@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from copy import copy
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor, nn
 
-from ..errors import CurviregError, InvalidInputError
+from ..errors import CurviregError, InvalidInputError, WorkerError
 from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import ViewSphere
 from ..matching import ViewBank, ViewMatcher, cached_bank
@@ -20,18 +21,29 @@ from ..utils.executors import Workers
 from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike, MeshLike
 from ..utils.precision import in_full_precision
 from .detection import detect_item
-from .inputs import ImageItem, image_items
+from .judging import best_of_meshes
+from .photograph import ImageItem, image_items
 from .refinement import refine
 from .result import FailedRegistration, Registration
-from .rival_meshes import best_of_meshes
 from .several import register_views
 from .stages import map_items, register_photographs
 from .target import Target
-from .workers import register_by_workers
 
 __all__ = ["Registrar"]
 
+MAX_BLOCK = 8  # photographs that a worker gets at a time
+
 Results = list[Registration | FailedRegistration]
+
+
+class _Task(NamedTuple):
+    """A photograph, by its number in the call."""
+
+    number: int
+    item: ImageItem | CurviregError
+    detects: bool
+
+
 ObjectLike: TypeAlias = MeshLike | ViewBank | ViewMatcher
 
 
@@ -205,7 +217,7 @@ class Registrar(Target):
     def register_items(
         self, items: Sequence[ImageItem | CurviregError], *, detects: bool = False
     ) -> Results:
-        """Register photographs that :func:`.inputs.image_items` has prepared, each to the best of
+        """Register photographs that :func:`.image_items` has prepared, each to the best of
         the meshes; ``detects`` searches for the object in the whole photographs.
 
         :meta private:
@@ -265,3 +277,45 @@ class Registrar(Target):
         if isinstance(result, FailedRegistration):
             raise result.error
         return result
+
+
+def register_by_workers(
+    registrar: Registrar,
+    workers: Workers,
+    items: Sequence[ImageItem | CurviregError],
+    *,
+    detects: bool,
+) -> Results:
+    """:meth:`.Registrar.register_items` by workers, which get a copy of the registrar each; a
+    photograph that ends them fails."""
+    tasks = [_Task(number, item, detects) for number, item in enumerate(items)]
+    size = max(1, min(MAX_BLOCK, len(tasks) // (2 * workers.count)))
+    blocks = (tasks[start : start + size] for start in range(0, len(tasks), size))
+    found: dict[int, Registration | FailedRegistration] = {}
+    for task, result in workers.map(_register_block, _quiet_copy(registrar), blocks):
+        if isinstance(result, WorkerError):
+            found[task.number] = FailedRegistration(result.of_image(task.number))
+        else:
+            found[task.number] = result
+    return [found[number] for number in range(len(items))]
+
+
+def _register_block(registrar: Registrar, tasks: Sequence[_Task]) -> Results:
+    """The results of a block, whose errors name the number of the photograph in the call."""
+    items = [task.item for task in tasks]
+    results = registrar.register_items(items, detects=tasks[0].detects)
+    return [
+        FailedRegistration(result.error.of_image(task.number))
+        if isinstance(result, FailedRegistration) and isinstance(task.item, ImageItem)
+        else result
+        for task, result in zip(tasks, results, strict=True)
+    ]
+
+
+def _quiet_copy(registrar: Registrar) -> Registrar:
+    """A copy that shows no progress and has no workers of its own."""
+    other = copy(registrar)
+    other.progress = False
+    other.workers = None
+    other.others = [_quiet_copy(one) for one in registrar.others]
+    return other

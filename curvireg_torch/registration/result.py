@@ -11,16 +11,14 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..errors import CurviregError, LostObjectError
+from ..fitting.exactness import Exactness, exactness_of
 from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import rotation_error, viewpoint_from_rotation
 from ..matching import Ranking
 from ..pipeline import FitSettings
-from .confidence import RELIABLE
-from .exactness import Exactness, exactness_of
-from .groups import Axis
-from .words import two_decimals
+from .confidence import RELIABLE, two_decimals
 
 Value = TypeVar("Value")
 
@@ -35,6 +33,7 @@ MOST_UNDETERMINED = 1.0
 # Fraction of the first pose's probability from which another one makes the answer ambiguous
 RIVAL_FRACTION = 0.5
 HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn
+AXIS_TOLERANCE = 15.0  # Degrees within which two axes are the same answer
 # Degrees within which two directions of view count as mirror images of each other
 MIRROR_ANGLE = 30.0
 
@@ -152,6 +151,30 @@ class Detection:
     response: float
     boxes: Tensor
     responses: Tensor
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Where the axis of a nearly round object points, whatever its turn about it.
+
+    Attributes:
+        direction: (3,) float64 unit vector in the frame of the pose's rotation.
+        probability: that it is within ``tolerance_deg`` of the truth.
+        tolerance_deg: degrees.
+
+    Example:
+        >>> axis = Axis(torch.tensor([0.0, 0.0, 1.0]), 0.95)
+        >>> axis.to_dict()
+        {'direction': [0.0, 0.0, 1.0], 'probability': 0.95, 'tolerance_deg': 15.0}
+    """
+
+    direction: Tensor
+    probability: float
+    tolerance_deg: float = AXIS_TOLERANCE
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON values."""
+        return {**vars(self), "direction": self.direction.tolist()}
 
 
 @dataclass(frozen=True)

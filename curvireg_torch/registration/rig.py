@@ -21,17 +21,16 @@ from ..geometry import rotation_error
 from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
 from ..geometry.crops import box_iou
+from ..geometry.framing import boxes_at, shown_in
 from ..geometry.viewpoint import angles_between
 from ..rendering.contours import ContourPoints
 from ..terms import crop_photographs
+from .block import Described, evidence_of
 from .confidence import MAX_MARGIN, refinement_confidence
-from .described import Described, evidence_of
-from .framing import shown_in
 from .hypotheses import Hypotheses
-from .inputs import ImageItem
+from .photograph import ImageItem
 from .result import Hypothesis, Registration
 from .target import Target, nearest_view
-from .tracker import boxes_at
 
 # World poses that are fitted in all photographs, those whose evidence is compared, and those fitted
 # at full size

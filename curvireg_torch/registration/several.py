@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..evidence import Evidence
+from ..geometry.framing import border_sides, boxes_at, outside_fraction
 from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike
 from .confidence import (
     MAX_MARGIN,
@@ -20,20 +21,11 @@ from .confidence import (
     undetermined_axes,
 )
 from .detection import detect
-from .framing import border_sides, outside_fraction
-from .inputs import (
-    ImageItem,
-    check_cameras,
-    copies_of,
-    image_items,
-    is_missing,
-    rig_cameras,
-)
+from .photograph import ImageItem, check_cameras, copies_of, image_items, is_missing, rig_cameras
 from .result import FailedRegistration, PhotographPose, Registration
 from .rig import ELSEWHERE, Answer, Found, Rig, RigPhotograph
 from .stages import register_photographs
 from .target import Target
-from .tracker import boxes_at
 
 # Hypotheses of each photograph that are compared in all, even if fewer are reported
 JOINT_HYPOTHESES = 5

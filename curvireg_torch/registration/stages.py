@@ -10,19 +10,35 @@ from torch import Tensor
 
 from ..errors import CurviregError
 from ..fitting.edges import EdgeCrops
+from ..geometry.framing import shown_in, whole_boxes
 from ..matching import Ranking
+from ..matching.search import search
 from ..terms import QueryFeatures
 from ..utils.precision import exact_convolutions
 from ..utils.segments import order_within, place_within
-from .block import Block, fitted_poses, keypoint_poses, least_starts, poses_of_views
-from .camera_check import with_checked_cameras
+from .block import (
+    Block,
+    Limits,
+    fitted_poses,
+    keypoint_poses,
+    least_starts,
+    poses_of_views,
+    with_details,
+    with_evidence,
+)
+from .camera import (
+    FINISHED,
+    limits_of,
+    with_checked_cameras,
+    with_fitted_focal_lengths,
+    with_focal_deviation,
+    with_possible_cameras,
+)
 from .confidence import are_near
-from .described import with_evidence
-from .focal import FINISHED
-from .framing import shown_in, whole_boxes
 from .hypotheses import (
     Hypotheses,
     best_views,
+    close_rivals,
     common_score,
     distinct_poses,
     fit_texture_of,
@@ -30,22 +46,10 @@ from .hypotheses import (
     with_edge_support,
     with_short_fit,
 )
-from .inputs import ImageItem, check_crop
-from .judging import judged
-from .mirror import compared_with_mirror_image
-from .priors import Limits
-from .refits import refitted
+from .judging import best_of_meshes, compared_with_mirror_image, judged, with_siblings
+from .photograph import ImageItem, check_crop
 from .result import FailedRegistration, Registration
-from .rival_meshes import best_of_meshes
-from .search import search
-from .siblings import with_siblings
 from .target import Target
-from .unknown_camera import (
-    limits_of,
-    with_fitted_focal_lengths,
-    with_focal_deviation,
-    with_possible_cameras,
-)
 
 Result = Registration | CurviregError
 
@@ -529,3 +533,47 @@ def _searched(target: Target, block: Block) -> list[Registration]:
         poses = block.moved_inside(poses.replaced(torch.tensor([0]), found))
         results.append(judged(target, block, p, with_evidence(target, block, poses)))
     return results
+
+
+def refitted(target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses) -> Hypotheses:
+    """Fit the best pose of each photograph again from where it is, then its close rivals: fits that
+    differ in effort cannot be compared. Results with a higher score are kept."""
+    weights = target.score_weights(exact=True)
+    best = poses.best(weights)
+    poses = _refitted(target, block, crops, poses, best)
+    scores = poses.scores(weights)
+    settings = target.pipeline.fit
+    close = []
+    different = []
+    for photograph in poses.photograph[best].tolist():
+        rows = poses.of(photograph)
+        some = poses[rows]
+        rivals = close_rivals(some, scores[rows], block.symmetries, behind=settings.close_score)
+        distinct = distinct_poses(
+            some[rivals], scores[rows][rivals], block.symmetries, angle=settings.same_pose_angle
+        )
+        close.append(rows[rivals])
+        different.append(rows[rivals[distinct][: settings.close_rivals]])
+    rivals = torch.cat(close)
+    if not len(rivals):
+        return poses
+    poses = _refitted(target, block, crops, poses, torch.cat(different))
+    return with_details(target, crops, poses, best, rivals)
+
+
+def _refitted(
+    target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses, index: Tensor
+) -> Hypotheses:
+    """Fit poses again, and keep the results that have a higher score."""
+    if not len(index):
+        return poses
+    before = poses[index]
+    fitted = fitted_poses(target, block, crops, before, refit=True)
+    moved = (before.T != fitted.T).flatten(1).any(dim=1).nonzero()[:, 0]
+    if not len(moved):
+        return poses
+    new = with_evidence(target, block, fitted[moved])
+    weights = target.score_weights(exact=True)
+    higher = new.evidence.scores(weights) > before.evidence.scores(weights)[moved]
+    better = (higher & block.keeps(new)).nonzero()[:, 0]
+    return poses.with_poses(index[moved[better]], new[better])

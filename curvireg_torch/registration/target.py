@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -13,15 +13,65 @@ from torch import Tensor
 
 from ..evidence import RANK_ALONE, EvidenceWeights
 from ..fitting.keypoints import KeypointMatches, Keypoints
+from ..geometry.framing import CropFrame, border_sides
+from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber, ViewMatcher
+from ..matching.detector import Detector
 from ..mesh import has_colours, mesh_radius, mesh_symmetries, mesh_warnings
 from ..mesh.mesh import mirrored
 from ..mesh.round_axis import RoundAxis, round_axis
+from ..mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from ..terms import QueryFeatures
-from .detector import Detector
-from .framing import CropFrame, border_sides
-from .inputs import ImageItem
-from .shape_symmetries import TellingSymmetries, telling_symmetries
+from .photograph import ImageItem
+
+# Symmetries that are compared, the identity among them: every 30 degrees of a body of revolution
+MAX_SIBLINGS = 12
+
+NOTABLE_FRACTION = 0.01
+"""Fraction of the surface from which a feature matters: poses that it tells apart are different
+answers, also where a photograph does not show it. The pull tab of a can has half of it."""
+
+
+@dataclass(frozen=True)
+class TellingSymmetries:
+    """Symmetries of a mesh's shape that a small feature tells from the identity.
+
+    Attributes:
+        transforms: (K, 4, 4), the identity first.
+        notable: whether the feature has ``NOTABLE_FRACTION`` of the surface.
+    """
+
+    transforms: Tensor
+    notable: bool = False
+
+    def __len__(self) -> int:
+        return len(self.transforms)
+
+
+def telling_symmetries(mesh: trimesh.Trimesh, symmetries: Tensor) -> TellingSymmetries:
+    """Those of the symmetries (S, 4, 4) of a mesh's shape that a small feature tells from the
+    identity; at most ``MAX_SIBLINGS``, far from each other."""
+    if len(symmetries) == 1:
+        return TellingSymmetries(symmetries)
+    chosen = spread(symmetries)
+    fractions = feature_fractions(mesh, chosen)
+    telling = fractions > FEATURE_FRACTION
+    telling[0] = True
+    return TellingSymmetries(chosen[telling], bool(fractions.max() >= NOTABLE_FRACTION))
+
+
+def spread(symmetries: Tensor) -> Tensor:
+    """At most ``MAX_SIBLINGS`` of the symmetries (S, 4, 4), the identity first, far from each
+    other."""
+    R = symmetries[:, :3, :3].double()
+    chosen = [0]
+    nearest = rotation_error(R, R[0])
+    while len(chosen) < min(MAX_SIBLINGS, len(R)):
+        farthest = int(nearest.argmax())
+        chosen.append(farthest)
+        nearest = torch.minimum(nearest, rotation_error(R, R[farthest]))
+    return symmetries[torch.tensor(chosen)]
+
 
 # Thickness of a mesh, as a fraction of its radius, below which it counts as flat
 FLAT_EXTENT = 1e-3
@@ -114,7 +164,8 @@ class Target:
         for orthographic views, too."""
         if not self.has_frame(box, size):
             return None
-        return CropFrame.of(box, size, self.bank.settings)
+        settings = self.bank.settings
+        return CropFrame.of(box, size, side=settings.image_size, margin=settings.margin)
 
     def has_frame(self, box: Tensor, size: tuple[int, int]) -> bool:
         """Whether there is a :meth:`frame_of` a box."""

@@ -15,16 +15,16 @@ from ..errors import MAX_VIEWER_FACES
 from ..geometry import Camera, rotation_error
 from ..jobs.store import to_json
 from ..mesh import mesh_unit, mesh_up
-from ..registration.words import (
+from ..registration.confidence import two_decimals
+from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
+from ..visualization.sheet import thumbnail
+from ..visualization.words import (
     measured,
     pose_in_words,
     remarks,
-    two_decimals,
     used_camera_in_words,
     view_in_words,
 )
-from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
-from ..visualization.sheet import thumbnail
 from .shot import Answer, Numbers, Result, Shot, numbers
 from .widgets import (
     button,

@@ -14,13 +14,14 @@ from ..geometry import rotation_error
 from ..matching import ViewDescriber
 from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
-from ..registration.inputs import ImageItem, image_item
-from ..registration.words import pose_in_words, two_decimals
+from ..registration.confidence import two_decimals
+from ..registration.photograph import ImageItem, image_item
 from ..terms import crop_photographs, photograph_field
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, ImageLike
 from .contours import Drawn, close_up, draw_window
 from .encoding import to_uint8
+from .words import pose_in_words
 
 # px of the photograph's longer side in the picture
 LEAST = 960

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..errors import OutputError
 from ..registration import FailedRegistration, Registrar, Registration
-from ..registration.words import two_decimals
+from ..registration.confidence import two_decimals
 from .contours import draw_window
 from .overlay import VERDICT_COLOURS
 

@@ -22,9 +22,9 @@ from curvireg_torch.evidence import Evidence
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.inspection.photographs import without_colours
-from curvireg_torch.registration import Follower, mirror
+from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
+from curvireg_torch.registration import Follower, judging
 from curvireg_torch.registration.confidence import are_near
-from curvireg_torch.registration.detection import SAME_OBJECT_OVERLAP
 from scripts.calibration.sets import ESTIMATED, GREY, MODELS, SETS, UPRIGHT, photographs_of
 
 Row: TypeAlias = dict[str, Any]
@@ -106,7 +106,7 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
     row = {"features": dict(result.confidence_features), "scores": scores[is_rival].tolist()}
     row |= {"evidence": evidence.table[is_rival].tolist()}
     row |= {"errors": errors_of(R, seen, S)[is_rival].tolist()}
-    row |= {"mirror": mirror.WARNING in result.warnings}
+    row |= {"mirror": judging.WARNING in result.warnings}
     best = result.hypotheses[0]
     is_unique = len(S) == 1  # else the covariance is that of another pose
     if best.covariance is not None and is_unique and row["errors"][0] < RIGHT:

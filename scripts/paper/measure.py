@@ -25,15 +25,9 @@ from curvireg_torch.filters import (
 from curvireg_torch.filters.focus import PAPER_THRESHOLD
 from curvireg_torch.geometry import pose_from_box, rotation_error, viewpoint_from_rotation
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
+from curvireg_torch.matching.search import BEST_VIEWS, coherent_of, different_views, refine, search
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import FIELDS, PRESETS, BankSettings, Pipeline, ViewPolicy
-from curvireg_torch.registration.search import (
-    BEST_VIEWS,
-    coherent_of,
-    different_views,
-    refine,
-    search,
-)
 from scripts.paper.cases import Case
 from scripts.paper.detectors import DETECTORS
 from scripts.paper.measures import (

@@ -35,6 +35,7 @@ from curvireg_torch.data import BOPDataset, Pascal3DPlus
 from curvireg_torch.errors import CurviregError, InvalidInputError
 from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.evaluation.benchmark import true_rotations
+from curvireg_torch.jobs.documents import line_document
 from curvireg_torch.jobs.entry import Observation, observe
 from curvireg_torch.jobs.photograph import register_observation
 from curvireg_torch.jobs.runner import results_digest
@@ -42,7 +43,6 @@ from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
-from curvireg_torch.registration.documents import line_document
 from curvireg_torch.terms import Appearance, BoxShape
 from curvireg_torch.utils.files import file_digest, text_digest, write_csv
 from curvireg_torch.utils.threads import map_on_threads

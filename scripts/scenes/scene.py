@@ -14,7 +14,7 @@ import torch
 
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
 from curvireg_torch.geometry.cameras import rotation_towards
-from curvireg_torch.registration.framing import outside_fraction
+from curvireg_torch.geometry.framing import outside_fraction
 from scripts.scenes.light import Light, random_light
 from scripts.scenes.materials import random_picture, random_rotation
 from scripts.scenes.surfaces import Array, Rng

@@ -21,7 +21,7 @@ from curvireg_torch.registration import block, stages
 from curvireg_torch.registration.confidence import KEYPOINT_PROBABILITY, detection_probability
 from curvireg_torch.registration.detection import detect, propose
 from curvireg_torch.registration.hypotheses import fit_poses, placed
-from curvireg_torch.registration.inputs import image_items
+from curvireg_torch.registration.photograph import image_items
 from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background
 

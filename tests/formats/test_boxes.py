@@ -14,7 +14,7 @@ from curvireg_torch.errors import CurviregWarning, InvalidInputError, MissingFil
 from curvireg_torch.formats.boxes import BoxFile, PictureSize, pixel_box, read_boxes
 from curvireg_torch.formats.pictures import oriented, picture_size
 from curvireg_torch.jobs.options import with_advice
-from curvireg_torch.registration.inputs import image_items
+from curvireg_torch.registration.photograph import image_items
 from tests._support.exif import exif, with_exif
 from tests._support.real_data import real_case
 

@@ -12,7 +12,7 @@ from curvireg_torch.data.images import read_photo
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.formats.masks import mask_as_shown, mask_file, read_mask
 from curvireg_torch.formats.pictures import picture_size
-from curvireg_torch.registration.inputs import image_item
+from curvireg_torch.registration.photograph import image_item
 from tests._support.exif import exif, with_exif
 
 OBJECT = np.zeros((20, 30), bool)

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint, transform
 from curvireg_torch.mesh import mesh_centre, mesh_radius
-from curvireg_torch.registration import camera_check
-from curvireg_torch.registration.camera_check import focal_contradiction
+from curvireg_torch.registration import camera as camera_module
+from curvireg_torch.registration.camera import focal_contradiction
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import learned_registrar
 
@@ -49,8 +49,8 @@ def test_a_focal_length_that_the_photograph_contradicts_is_named_and_not_reliabl
 def test_focal_lengths_of_several_photographs_are_compared_at_once(monkeypatch):
     image, box = near_photograph()
     given = []
-    measure = camera_check.focal_gaps
-    monkeypatch.setattr(camera_check, "focal_gaps", lambda *a: given.append(a) or measure(*a))
+    measure = camera_module.focal_gaps
+    monkeypatch.setattr(camera_module, "focal_gaps", lambda *a: given.append(a) or measure(*a))
     for factor in (0.8, 1.0, 1.25):
         learned_registrar()([image], box[None], camera(factor))
     contours, crops = given[0][:2]

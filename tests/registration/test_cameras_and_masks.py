@@ -12,7 +12,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import undistorted
 from curvireg_torch.geometry.cameras import boxes_around
 from curvireg_torch.registration import FailedRegistration, Follower, detect
-from curvireg_torch.registration.inputs import image_item, image_items
+from curvireg_torch.registration.photograph import image_item, image_items
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_registrar
 

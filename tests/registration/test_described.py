@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from curvireg_torch import Pipeline
+from curvireg_torch.geometry.framing import CropFrame
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import FitSettings
-from curvireg_torch.registration.described import Described, counting_keypoints, evidence_of
-from curvireg_torch.registration.framing import CropFrame
+from curvireg_torch.registration.block import Described, counting_keypoints, evidence_of
 from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene
 

@@ -19,13 +19,13 @@ from curvireg_torch.geometry import (
     viewpoint_from_rotation,
 )
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
+from curvireg_torch.matching.detector import _medoids
 from curvireg_torch.registration import Detector, Proposals, detect
 from curvireg_torch.registration import detection as detection_module
 from curvireg_torch.registration.detection import Candidate, Found, _add, _allowed_views
-from curvireg_torch.registration.detector import _medoids
-from curvireg_torch.registration.inputs import ImageItem
-from curvireg_torch.registration.words import corners
+from curvireg_torch.registration.photograph import ImageItem
 from curvireg_torch.synthetic import example_mesh, procedural_background
+from curvireg_torch.visualization.words import corners
 from tests._support.scenes import CAMERA, scene, unrefined
 
 SIZE = (240, 320)

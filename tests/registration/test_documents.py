@@ -6,13 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from curvireg_torch.jobs.documents import detection_document, line_document, result_document
 from curvireg_torch.registration import Detection
-from curvireg_torch.registration.documents import (
-    detection_document,
-    line_document,
-    result_document,
-)
-from curvireg_torch.registration.words import remarks
+from curvireg_torch.visualization.words import remarks
 from tests._support.results import registration
 
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from curvireg_torch.calibration import CALIBRATION
+from curvireg_torch.fitting.exactness import Exactness, exactness_of
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
 from curvireg_torch.geometry.cameras import rotation_towards
-from curvireg_torch.registration.exactness import Exactness, exactness_of
-from curvireg_torch.registration.focal import principal_covariance
+from curvireg_torch.registration.camera import principal_covariance
 from curvireg_torch.registration.hypotheses import Hypotheses, placed
-from curvireg_torch.registration.words import remarks
+from curvireg_torch.visualization.words import remarks
 from tests._support.results import registration
 from tests._support.scenes import CAMERA
 

@@ -11,9 +11,9 @@ from curvireg_torch.fitting import focal_length
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error
 from curvireg_torch.geometry.cameras import point_in_cameras, rotation_towards
-from curvireg_torch.registration import focal, unknown_camera
+from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.hypotheses import Hypotheses, projected_box
-from curvireg_torch.registration.inputs import image_item
+from curvireg_torch.registration.photograph import image_item
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 from tests.fitting.test_focal_length import NEAR, near_scene
@@ -29,7 +29,7 @@ def test_covariance_and_deviation_of_the_focal_length():
     )
     poses = replace(poses, covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
     item = replace(image_item(image, box, NEAR), focal_deviation=0.05, camera_source="exif")
-    covariance, deviation = focal.focal_covariance(describer, crops, poses, item)
+    covariance, deviation = camera_module.focal_covariance(describer, crops, poses, item)
     assert 0.0 < deviation < 0.05, "the prior and the photograph together"
     z = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
     assert float(covariance[0, 5, 5].sqrt()) == pytest.approx(deviation * z, rel=0.5), (
@@ -87,7 +87,7 @@ def test_focal_lengths_with_small_deviations_are_right():
 def test_rivals_are_also_tried_with_the_focal_length_of_the_best(factor, first):
     """One camera took the photograph: each begins from the other's, where these differ."""
     focal_lengths = torch.tensor([500.0, 100.0, 500.0 * factor])
-    index, starts = unknown_camera._focal_starts(torch.tensor([2, 0]), focal_lengths)
+    index, starts = camera_module._focal_starts(torch.tensor([2, 0]), focal_lengths)
     assert index.tolist() == [2, 0, *[2, 0] * first]
     assert starts.tolist() == pytest.approx(
         [500.0 * factor, 500.0, *[500.0, 500.0 * factor] * first]
@@ -99,7 +99,7 @@ def test_zoomed_poses_keep_their_images():
     describer = truck_registrar().describer
     one = torch.zeros(1, dtype=torch.long)
     poses = Hypotheses.at(T[None], NEAR[None], describer.centre, one, one.double())
-    moved = focal.zoomed(poses, torch.tensor([2.0 * float(NEAR[0, 0])]), describer.centre)
+    moved = camera_module.zoomed(poses, torch.tensor([2.0 * float(NEAR[0, 0])]), describer.centre)
     assert float(moved.cameras[0, 0, 0]) == pytest.approx(2.0 * float(NEAR[0, 0]))
     assert float(moved.distance[0]) > 1.9 * float(poses.distance[0])
     before = projected_box(describer, (T, NEAR))
@@ -113,7 +113,7 @@ def test_zoomed_poses_keep_their_images():
 
 
 def test_fields_of_view_are_across_the_longer_side():
-    wide, tall = (focal.possible_cameras(size) for size in ((480, 640), (640, 480)))
+    wide, tall = (camera_module.possible_cameras(size) for size in ((480, 640), (640, 480)))
     assert [float(K[0, 0]) for K in wide] == [float(K[0, 0]) for K in tall]
     assert tall[0][:2, 2].tolist() == [239.5, 319.5]
     assert float(wide[2][0, 0]) == pytest.approx(320 / 0.41421356, rel=1e-6)
@@ -123,11 +123,13 @@ def test_priors_by_source():
     image, box, _ = near_scene()
     item = image_item(image, box, NEAR)
     cameras = focal_length.scaled_cameras(NEAR[None], torch.tensor([0.1]).double())
-    exif = focal.focal_prior(replace(item, focal_deviation=0.05, camera_source="exif"), cameras)
+    exif = camera_module.focal_prior(
+        replace(item, focal_deviation=0.05, camera_source="exif"), cameras
+    )
     assert float(exif.log_zoom) == pytest.approx(-0.1)
     assert (float(exif.low), float(exif.high)) == (pytest.approx(-0.3), pytest.approx(0.1))
     assert (exif.deviation, exif.reach) == (0.05, float("inf"))
-    usual = focal.focal_prior(replace(item, camera_source="estimated"), NEAR[None])
+    usual = camera_module.focal_prior(replace(item, camera_source="estimated"), NEAR[None])
     assert float(usual.log_zoom.exp()) == pytest.approx(
         focal_length.USUAL_FOCAL * max(SIZE) / 150.0
     )
@@ -148,7 +150,7 @@ def test_the_deviation_joins_prior_and_photograph():
 
     def variance(prior):
         known = replace(item, focal_deviation=prior)
-        return focal.focal_covariance(describer, crops, poses, known)[1] ** 2
+        return camera_module.focal_covariance(describer, crops, poses, known)[1] ** 2
 
     photograph = variance(1e6)
     for prior in (0.01, 0.1):
@@ -161,8 +163,8 @@ def test_an_unknown_principal_point_moves_the_object_with_its_ray_and_keeps_its_
     T = scene(0)[2][None].double()
     none = torch.zeros(1)
     pose = Hypotheses.at(T, CAMERA[None], centre, none.long(), none.double())
-    covariance = focal.principal_covariance(pose, size, centre)[0]
-    pixels = focal.PRINCIPAL_DEVIATION * 240
+    covariance = camera_module.principal_covariance(pose, size, centre)[0]
+    pixels = camera_module.PRINCIPAL_DEVIATION * 240
     moved_by = torch.zeros(6, 6, dtype=torch.float64)
     for axis in range(2):
         step = 1e-4

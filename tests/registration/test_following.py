@@ -13,8 +13,8 @@ from curvireg_torch import Registrar
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import pose_around
-from curvireg_torch.registration import FailedRegistration, Follower, following, refine
-from curvireg_torch.registration.following import BELIEVED_CONFIDENCE
+from curvireg_torch.registration import FailedRegistration, Follower, refine, tracking
+from curvireg_torch.registration.tracking import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, sequence, truck_registrar
 
@@ -39,7 +39,7 @@ def test_follower_starts_from_a_known_pose_without_registering(monkeypatch):
     registrar = truck_registrar()
     follow = Follower(registrar, CAMERA)
     follow.start(frames[0][0], frames[0][2])
-    monkeypatch.setattr(following, "refine_item", None)  # neither search
+    monkeypatch.setattr(tracking, "refine_item", None)  # neither search
     monkeypatch.setattr(type(registrar), "__call__", None)  # nor registration
     for image, _, T in frames[1:]:
         result = follow(image)
@@ -173,16 +173,16 @@ def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
     follow = Follower(learned_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2])
     with monkeypatch.context() as patch:
-        patch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: 0.3)
-        patch.setattr(following, "refine_item", LOST)
+        patch.setattr("curvireg_torch.registration.tracking.tracking_confidence", lambda _: 0.3)
+        patch.setattr(tracking, "refine_item", LOST)
         assert follow(frames[1][0]).confidence == pytest.approx(0.3)
     with monkeypatch.context() as patch:
-        patch.setattr(following, "refine_item", LOST)
+        patch.setattr(tracking, "refine_item", LOST)
         assert follow(frames[2][0]).confidence <= 0.3
     confirmed = follow(frames[3][0])
     assert confirmed.confidence > BELIEVED_CONFIDENCE
     assert errors(confirmed, frames[3][2])[0] < 4.0
-    monkeypatch.setattr(following, "refine_item", LOST)
+    monkeypatch.setattr(tracking, "refine_item", LOST)
     assert follow(frames[4][0]).confidence > BELIEVED_CONFIDENCE, "tracked from the confirmed pose"
 
 
@@ -214,10 +214,10 @@ def test_follower_refines_where_tracking_is_doubtful(monkeypatch):
         example_mesh(), jumped, CAMERA, SIZE, torch.Generator().manual_seed(9)
     )[0]
     calls = []
-    refine_item = following.refine_item
-    monkeypatch.setattr(following, "TRUSTED_CONFIDENCE", 1.1)  # whatever the tracker says
+    refine_item = tracking.refine_item
+    monkeypatch.setattr(tracking, "TRUSTED_CONFIDENCE", 1.1)  # whatever the tracker says
     monkeypatch.setattr(
-        following, "refine_item", lambda *a, **k: calls.append(a) or refine_item(*a, **k)
+        tracking, "refine_item", lambda *a, **k: calls.append(a) or refine_item(*a, **k)
     )
     follow = Follower(truck_registrar(), CAMERA)
     follow.start(image, T)
@@ -231,9 +231,9 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
     follow = Follower(truck_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2])
     monkeypatch.setattr(
-        "curvireg_torch.registration.tracker.tracking_confidence", lambda _: tracked
+        "curvireg_torch.registration.tracking.tracking_confidence", lambda _: tracked
     )
-    monkeypatch.setattr(following, "refine_item", LOST)
+    monkeypatch.setattr(tracking, "refine_item", LOST)
     monkeypatch.setattr(
         Registrar, "__call__", lambda *_, **__: [FailedRegistration(LostObjectError("no"))]
     )
@@ -248,8 +248,8 @@ def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, 
     registrar = truck_registrar()
     follow = Follower(registrar, CAMERA)
     follow.start(frames[0][0], frames[0][2])
-    monkeypatch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: 0.1)
-    monkeypatch.setattr(following, "refine_item", LOST)
+    monkeypatch.setattr("curvireg_torch.registration.tracking.tracking_confidence", lambda _: 0.1)
+    monkeypatch.setattr(tracking, "refine_item", LOST)
     answering(monkeypatch, registrar, [confidence])
     result = follow(*frames[1][:2])
     assert result.ok == used
@@ -283,9 +283,9 @@ def test_frames_below_one_half_are_checked_and_a_start_of_no_confidence_is_kept(
         calls = []
         follow = Follower(learned_registrar(), CAMERA)
         follow.start(frames[0][0], frames[0][2], confidence=confidence)
-        refined = following.refine_item
+        refined = tracking.refine_item
         monkeypatch.setattr(
-            following, "refine_item", lambda *a, f=refined, c=calls: (c.append(1), f(*a))[1]
+            tracking, "refine_item", lambda *a, f=refined, c=calls: (c.append(1), f(*a))[1]
         )
         monkeypatch.setattr(
             follow, "_registered", lambda *_: pytest.fail("the given pose was dropped")

@@ -6,17 +6,17 @@ import torch
 import trimesh
 
 from curvireg_torch.geometry import camera_matrix
-from curvireg_torch.pipeline import BankSettings
-from curvireg_torch.registration.framing import (
+from curvireg_torch.geometry.framing import (
     CropFrame,
     border_sides,
     clipped,
     outside_fraction,
-    outside_warnings,
     shown_in,
     whole_boxes,
 )
-from curvireg_torch.registration.inputs import image_item
+from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.registration.judging import outside_warnings
+from curvireg_torch.registration.photograph import image_item
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene
 
 SQUARE = torch.from_numpy(trimesh.creation.box((1.0, 1.0, 0.001)).vertices.copy())

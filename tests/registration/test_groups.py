@@ -11,14 +11,8 @@ from curvireg_torch import Registrar, Registration, ViewBank, sample_views
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.mesh.round_axis import RoundAxis
 from curvireg_torch.registration.confidence import probability_of_any, shares
-from curvireg_torch.registration.groups import (
-    AXIS_TOLERANCE,
-    Axis,
-    Rivals,
-    axis_of,
-    directions_agree,
-    pair_probability,
-)
+from curvireg_torch.registration.judging import Rivals, axis_of, directions_agree, pair_probability
+from curvireg_torch.registration.result import AXIS_TOLERANCE, Axis
 from curvireg_torch.visualization.contours import AXIS
 from curvireg_torch.visualization.overlay import contour_overlay, registration_sheet
 from tests._support.canisters import canister

@@ -9,8 +9,9 @@ import torch
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.pipeline import FitSettings
-from curvireg_torch.registration import Registrar, inputs, stages
-from curvireg_torch.registration.inputs import ImageItem, camera_warnings, image_items
+from curvireg_torch.registration import Registrar, stages
+from curvireg_torch.registration import photograph as photograph_module
+from curvireg_torch.registration.photograph import ImageItem, camera_warnings, image_items
 from tests._support.scenes import (
     CAMERA,
     SIZE,
@@ -81,7 +82,7 @@ def test_result_with_a_questionable_camera_is_never_reliable():
 
 
 def test_photographs_are_decoded_once_and_not_kept(tmp_path, monkeypatch):
-    read_photo = inputs.read_photo
+    read_photo = photograph_module.read_photo
     alive = weakref.WeakSet()
     most = [0]
     decoded = []
@@ -93,7 +94,7 @@ def test_photographs_are_decoded_once_and_not_kept(tmp_path, monkeypatch):
         most[0] = max(most[0], len(alive))
         return photo
 
-    monkeypatch.setattr(inputs, "read_photo", counted)
+    monkeypatch.setattr(photograph_module, "read_photo", counted)
     monkeypatch.setitem(stages.BLOCK, "cpu", 2)
     scenes = [scene(seed) for seed in range(6)]
     paths = [tmp_path / f"{seed}.png" for seed in range(6)]

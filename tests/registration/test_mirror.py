@@ -6,7 +6,7 @@ import trimesh
 
 from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
-from curvireg_torch.registration import mirror
+from curvireg_torch.registration import judging
 from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support.poses import poses as random_poses
 from tests._support.scenes import CAMERA, learned_registrar, scene
@@ -40,7 +40,7 @@ def test_reflected_poses_show_the_mesh_reflected():
     rotation = T[0, :3, :3]
     plane = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     centres = mesh_centre(mesh), mesh_centre(mirrored(mesh))
-    found = mirror.reflected_poses(placed_at(T, mesh), plane, *centres).T
+    found = judging.reflected_poses(placed_at(T, mesh), plane, *centres).T
     vertices = torch.from_numpy(mesh.vertices.copy())
     seen = vertices @ rotation.T + T[0, :3, 3]
     position = rotation @ mesh_centre(mesh) + T[0, :3, 3]
@@ -57,9 +57,9 @@ def test_confidence_falls_where_the_mirror_image_fits_better(monkeypatch):
     image, box, _ = scene(0)
     known = learned_registrar()
     for gain, is_doubted in ((-1.0, False), (0.4, False), (1.5, True)):
-        monkeypatch.setattr(mirror, "mirror_gain", lambda *_, gain=gain: torch.tensor([gain]))
+        monkeypatch.setattr(judging, "mirror_gain", lambda *_, gain=gain: torch.tensor([gain]))
         result = known([image], box[None], CAMERA)[0]
-        assert (mirror.WARNING in result.warnings) == is_doubted
+        assert (judging.WARNING in result.warnings) == is_doubted
         assert result.reliable != is_doubted
         if is_doubted:
             assert result.confidence < 0.5
@@ -67,21 +67,21 @@ def test_confidence_falls_where_the_mirror_image_fits_better(monkeypatch):
 
 def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
     gains = []
-    measure = mirror.mirror_gain
+    measure = judging.mirror_gain
 
     def recorded(*given):
         gain = measure(*given)
         gains.extend(gain.tolist())
         return gain
 
-    monkeypatch.setattr(mirror, "mirror_gain", recorded)
+    monkeypatch.setattr(judging, "mirror_gain", recorded)
     image, box, _ = scene(0)
     own = learned_registrar()
     assert own([image], box[None], CAMERA)[0].reliable
     views = sample_views(azimuth_step=15, elevations=[0, 20, 40, 60])
     mesh = mirrored(own.bank.mesh)
     bank = ViewBank.build(mesh, views, image_size=96, progress=False)
-    monkeypatch.setattr(mirror, "LEAST_CONFIDENCE", 0.0)
+    monkeypatch.setattr(judging, "LEAST_CONFIDENCE", 0.0)
     flipped = Registrar(bank)([image], box[None], CAMERA)[0]
-    assert mirror.WARNING in flipped.warnings
+    assert judging.WARNING in flipped.warnings
     assert gains[0] < 0.0 < gains[1]

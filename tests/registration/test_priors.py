@@ -15,9 +15,9 @@ from curvireg_torch.geometry import (
     viewpoint_from_rotation,
 )
 from curvireg_torch.geometry.pose_prior import PosePrior
+from curvireg_torch.registration.block import Limits
 from curvireg_torch.registration.hypotheses import Hypotheses
-from curvireg_torch.registration.inputs import ImageItem
-from curvireg_torch.registration.priors import Limits
+from curvireg_torch.registration.photograph import ImageItem
 from tests._support.scenes import CAMERA, learned_registrar, scene, truck_bank, truck_registrar
 
 IMAGE, BOX, T = scene(0)

@@ -15,7 +15,7 @@ from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.evaluation.metrics import symmetric_rotation_error
 from curvireg_torch.geometry import projected_boxes, rotation_error, symmetry_transforms, transform
 from curvireg_torch.registration import Follower
-from curvireg_torch.registration.following import BELIEVED_CONFIDENCE
+from curvireg_torch.registration.tracking import BELIEVED_CONFIDENCE
 from tests._support.real_data import real_data
 
 pytestmark = pytest.mark.data

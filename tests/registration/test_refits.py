@@ -11,7 +11,7 @@ from torch import Tensor
 from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.pipeline import Pipeline
-from curvireg_torch.registration import refits
+from curvireg_torch.registration import stages
 from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support.scenes import CAMERA
 
@@ -41,9 +41,9 @@ class Refits:
         self.new = new
         self.fitted: list[list[int]] = []
         self.compared: list[tuple[int, list[int]]] = []
-        monkeypatch.setattr(refits, "fitted_poses", self.fit)
-        monkeypatch.setattr(refits, "with_evidence", self.measure)
-        monkeypatch.setattr(refits, "with_details", self.compare)
+        monkeypatch.setattr(stages, "fitted_poses", self.fit)
+        monkeypatch.setattr(stages, "with_evidence", self.measure)
+        monkeypatch.setattr(stages, "with_details", self.compare)
 
     def fit(
         self, target: Any, block: Any, crops: Any, starts: Hypotheses, *, refit: bool
@@ -84,7 +84,7 @@ class Refits:
         crops: Any = None
         excluded = torch.tensor(outside or [False] * len(poses))
         before = replace(poses, evidence=evidence, is_outside=excluded)
-        after = refits.refitted(target, block, crops, before)
+        after = stages.refitted(target, block, crops, before)
         return (after.T != poses.T).flatten(1).any(dim=1).tolist(), after.evidence
 
 

@@ -24,16 +24,10 @@ from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS, FitSettings
-from curvireg_torch.registration import (
-    FailedRegistration,
-    Follower,
-    block,
-    hypotheses,
-    stages,
-)
-from curvireg_torch.registration import described as described_module
+from curvireg_torch.registration import FailedRegistration, Follower, block, hypotheses, stages
+from curvireg_torch.registration import block as described_module
 from curvireg_torch.registration import registrar as registrar_module
-from curvireg_torch.registration.inputs import ImageItem, check_crop
+from curvireg_torch.registration.photograph import ImageItem, check_crop
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import (

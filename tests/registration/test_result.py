@@ -10,8 +10,7 @@ import torch
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.registration import FailedRegistration
-from curvireg_torch.registration.groups import Axis
-from curvireg_torch.registration.result import ambiguity
+from curvireg_torch.registration.result import Axis, ambiguity
 from tests._support.results import registration
 
 

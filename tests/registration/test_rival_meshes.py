@@ -13,7 +13,7 @@ from curvireg_torch.errors import LostObjectError
 from curvireg_torch.fitting.details import ContourDetails
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.registration import FailedRegistration
-from curvireg_torch.registration.rival_meshes import best_of_meshes, joined
+from curvireg_torch.registration.judging import best_of_meshes, joined
 from tests._support.results import registration
 from tests._support.scenes import CAMERA, learned_registrar
 from tests.registration.test_ties import photograph

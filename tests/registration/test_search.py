@@ -19,9 +19,10 @@ from curvireg_torch.geometry import (
     sample_views,
     viewpoint_from_rotation,
 )
+from curvireg_torch.matching import search
 from curvireg_torch.mesh.mesh import principal_rotation
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
-from curvireg_torch.registration import block, hypotheses, search, stages
+from curvireg_torch.registration import block, hypotheses, stages
 from curvireg_torch.terms import Appearance
 from tests._support.scenes import CAMERA, scene, truck_bank
 

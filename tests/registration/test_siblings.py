@@ -16,10 +16,10 @@ from curvireg_torch.geometry import (
     rotation_from_viewpoint,
     transform,
 )
-from curvireg_torch.registration import siblings
+from curvireg_torch.registration import judging
 from curvireg_torch.registration.hypotheses import Hypotheses
-from curvireg_torch.registration.shape_symmetries import TellingSymmetries
-from curvireg_torch.registration.siblings import Siblings
+from curvireg_torch.registration.judging import Siblings
+from curvireg_torch.registration.target import TellingSymmetries
 from tests._support.scenes import CAMERA
 
 
@@ -98,11 +98,11 @@ class Case:
         self.symmetries = turns_about_z(3)
         self.poses = four([0.0] * 3, [[0.0] * 3] * 3, [0, 40, 80]).poses
         different = ~torch.eye(3, dtype=torch.bool)
-        monkeypatch.setattr(siblings, "fitted_poses", self.fit)
-        monkeypatch.setattr(siblings, "on_device", lambda *_: torch.arange(3))
-        monkeypatch.setattr(siblings, "compared", lambda _: (torch.zeros(3, 3).double(), different))
+        monkeypatch.setattr(judging, "fitted_poses", self.fit)
+        monkeypatch.setattr(judging, "on_device", lambda *_: torch.arange(3))
+        monkeypatch.setattr(judging, "compared", lambda _: (torch.zeros(3, 3).double(), different))
         monkeypatch.setattr(
-            siblings,
+            judging,
             "with_evidence",
             lambda _, __, poses: replace(
                 poses, evidence=evidence(*measured) if len(poses) == 3 else evidence(0.95)
@@ -133,7 +133,7 @@ class Case:
         outside = torch.tensor([True, False, False])
         given = evidence(0.99, 0.9, 0.5)
         before = replace(self.poses, evidence=given, is_outside=outside)
-        after, rival, _ = siblings.with_siblings(target, block, crops, before)
+        after, rival, _ = judging.with_siblings(target, block, crops, before)
         assert not bool(rival.is_outside.any())
         assert bool(rival.is_sibling.all())
         return after, after.evidence, rival

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from curvireg_torch.registration.inputs import MIN_BOX_SIDE
-from curvireg_torch.registration.starts import INVERSE, OPENGL, why_outside
+from curvireg_torch.registration.photograph import MIN_BOX_SIDE
+from curvireg_torch.registration.refinement import INVERSE, OPENGL, why_outside
 
 SIZE = (180, 240)
 K = torch.tensor([[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]], dtype=torch.float64)

@@ -13,7 +13,7 @@ from curvireg_torch import Registrar, Registration, ViewBank, sample_views
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint, transform
 from curvireg_torch.mesh import mesh_centre, mesh_radius, mesh_symmetries
 from curvireg_torch.mesh.symmetry import FEATURE_FRACTION, feature_fractions
-from curvireg_torch.registration.shape_symmetries import MAX_SIBLINGS, spread, telling_symmetries
+from curvireg_torch.registration.target import MAX_SIBLINGS, spread, telling_symmetries
 from curvireg_torch.synthetic import synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE
 

@@ -29,8 +29,8 @@ from curvireg_torch.fitting.texture_fit import surface_corners
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.mesh.mesh import extreme_points
-from curvireg_torch.registration import tracker
-from curvireg_torch.registration.tracker import FLOW_SCALES, Tracker
+from curvireg_torch.registration import tracking
+from curvireg_torch.registration.tracking import FLOW_SCALES, Tracker
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
@@ -139,7 +139,7 @@ def test_flow_that_does_not_lead_back_is_left_out_and_a_uniform_surface_has_none
 def test_each_measurement_alone_moves_the_outline_onto_a_plain_cube(monkeypatch, weight):
     """Without points, and without colours or nearly without edges."""
     for name, value in (("POINT_WEIGHT", 0.0), ("KEYFRAME_WEIGHT", 0.0), ("REGION_WEIGHT", weight)):
-        monkeypatch.setattr(tracker, name, value)
+        monkeypatch.setattr(tracking, name, value)
     truth = moved(START, [0.0, 0.0, 0.03], [0.03, -0.02, 0.0])
     follow = make_tracker(cube())
     follow.start(drawn(START), K, START)

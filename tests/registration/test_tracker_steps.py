@@ -11,8 +11,9 @@ from torch import Tensor
 
 from curvireg_torch.fitting.edges import CROP_SIZE
 from curvireg_torch.fitting.regions import RegionModel, Silhouette
-from curvireg_torch.registration import tracker
-from curvireg_torch.registration.tracker import Tracker, boxes_at
+from curvireg_torch.geometry.framing import boxes_at
+from curvireg_torch.registration import tracking
+from curvireg_torch.registration.tracking import Tracker
 from tests.fitting.cube import pose
 
 K = torch.tensor([[200.0, 0, 99.5], [0, 200.0, 49.5], [0, 0, 1]], dtype=torch.float64)
@@ -115,9 +116,9 @@ def fitted(
         assert state.points == ("again" if stale else None)
         return float(frame.K[0, 0, 0]), len(flows)
 
-    monkeypatch.setattr(tracker, "track_points", track)
-    monkeypatch.setattr(tracker, "fit_points", lambda *_: at(x=5.0 * shift))
-    monkeypatch.setattr(tracker, "PointMatches", SimpleNamespace(cat_within=list))
+    monkeypatch.setattr(tracking, "track_points", track)
+    monkeypatch.setattr(tracking, "fit_points", lambda *_: at(x=5.0 * shift))
+    monkeypatch.setattr(tracking, "PointMatches", SimpleNamespace(cat_within=list))
     angles = torch.tensor([9.0, 2.0, 5.0])
     follow: Any = SimpleNamespace(
         _last=last,
@@ -143,15 +144,15 @@ def named(name: str) -> Any:
 def test_a_fit_uses_the_flow_from_the_last_frame_and_from_the_nearest_keyframe(monkeypatch):
     """Both in the crop of the pose that the flow gives."""
     keyframes = [named("a"), named("b"), named("c")]
-    last = (tracker.POINT_WEIGHT, f"last {tracker.PYRAMID_LAST}", 2.0)
-    from_keyframe = (tracker.KEYFRAME_WEIGHT, f"b {tracker.PYRAMID_KEYFRAME}", 2.0)
+    last = (tracking.POINT_WEIGHT, f"last {tracking.PYRAMID_LAST}", 2.0)
+    from_keyframe = (tracking.KEYFRAME_WEIGHT, f"b {tracking.PYRAMID_KEYFRAME}", 2.0)
     assert fitted(monkeypatch, keyframes, named("last")) == [last, from_keyframe]
-    alone = (tracker.POINT_WEIGHT, f"b {tracker.PYRAMID_LAST}", 2.0)
+    alone = (tracking.POINT_WEIGHT, f"b {tracking.PYRAMID_LAST}", 2.0)
     assert fitted(monkeypatch, keyframes, keyframes[1]) == [alone]
 
 
 def test_the_crop_of_the_predicted_pose_serves_where_the_flow_moves_it_little(monkeypatch):
-    limit = tracker.WINDOW_SHIFT
+    limit = tracking.WINDOW_SHIFT
     for sign in (-1.0, 1.0):
         for shift, camera in ((0.99 * limit, 1.0), (1.01 * limit, 2.0)):
             used = fitted(monkeypatch, [named("a"), named("b")], named("last"), sign * shift)
@@ -160,11 +161,11 @@ def test_the_crop_of_the_predicted_pose_serves_where_the_flow_moves_it_little(mo
 
 @pytest.mark.parametrize("stale", [False, True])
 def test_a_round_is_left_out_after_one_that_hardly_moved_the_contours(monkeypatch, stale):
-    first, *between, last = tracker.SEARCH_RADII
+    first, *between, last = tracking.SEARCH_RADII
     assert first > last
     radii = [first, *between, last] if stale else [first, last]
     fitted(monkeypatch, [named("a")], named("last"), stale=stale, searched=(searched := []))
-    assert searched == [radius for radius in radii for _ in range(tracker.STEPS_PER_ROUND)]
+    assert searched == [radius for radius in radii for _ in range(tracking.STEPS_PER_ROUND)]
 
 
 def features(mean: list[float], variance: list[float], flows: list[Flow]) -> dict[str, float]:
@@ -183,7 +184,7 @@ def features(mean: list[float], variance: list[float], flows: list[Flow]) -> dic
 
 def test_features_in_closed_form():
     """A flat posterior has a variance of a third of the radius' square."""
-    flat = tracker.REGION_FEATURE_RADIUS**2 / 3.0
+    flat = tracking.REGION_FEATURE_RADIUS**2 / 3.0
     one, other = Flow(K, ratio=0.8), Flow(K, ratio=0.3)
     found = features([0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.5 * flat, flat], [one, other])
     assert found == pytest.approx(
@@ -255,7 +256,7 @@ def test_a_turn_goes_on_about_the_axes_of_the_camera():
 
 @pytest.mark.parametrize(("angle", "count"), [(7.9, 1), (8.1, 2)])
 def test_frames_from_other_directions_are_kept(monkeypatch, angle, count):
-    monkeypatch.setattr(tracker, "surface_corners", lambda *_, **__: (None, None))
+    monkeypatch.setattr(tracking, "surface_corners", lambda *_, **__: (None, None))
     follow: Any = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([50.0, angle]))
     frame: Any = SimpleNamespace(grey=None, K=K)
     nothing: Any = None
@@ -266,14 +267,14 @@ def test_frames_from_other_directions_are_kept(monkeypatch, angle, count):
 
 
 def test_so_many_keyframes_are_kept(monkeypatch):
-    monkeypatch.setattr(tracker, "surface_corners", lambda *_, **__: (None, None))
+    monkeypatch.setattr(tracking, "surface_corners", lambda *_, **__: (None, None))
     follow: Any = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([90.0]))
     frame: Any = SimpleNamespace(grey=None, K=K)
     nothing: Any = None
     for x in range(40):
         Tracker._remember(follow, frame, at(float(x)), nothing)
     kept = [float(keyframe.T[0, 0, 3]) for keyframe in follow._keyframes]
-    assert kept == [float(x) for x in range(40 - tracker.MAX_KEYFRAMES, 40)], "the latest"
+    assert kept == [float(x) for x in range(40 - tracking.MAX_KEYFRAMES, 40)], "the latest"
 
 
 def test_colours_are_learned_on_both_sides_of_the_outline():
@@ -298,7 +299,7 @@ def test_colours_are_learned_on_both_sides_of_the_outline():
     state: Any = None
     Tracker._learn(follow, frame, state, depth)
     x, inside = learned
-    band = tracker.LEARNED_BAND
+    band = tracking.LEARNED_BAND
     count = len(band)
     assert len(x) == 3 * 2 * count
     assert int(inside.sum()) == 3 * count
@@ -310,7 +311,7 @@ def test_colours_are_learned_on_both_sides_of_the_outline():
 def test_lines_along_which_colours_say_nothing_do_not_count():
     """A variance as flat as a search of 4 px has: 16 / 3, of which half a px² is the tracker's."""
     radius = 4
-    flat = radius**2 / 3.0 - tracker.REGION_VARIANCE
+    flat = radius**2 / 3.0 - tracking.REGION_VARIANCE
     mean = torch.tensor([1.0, 2.0, -1.0]).double()
     variance = torch.tensor([0.0, flat, 2.0 * flat]).double()
     J = torch.ones(1, 3, 6).double()
@@ -320,8 +321,8 @@ def test_lines_along_which_colours_say_nothing_do_not_count():
     frame: Any = SimpleNamespace(bins=None)
     nothing: Any = None
     colours = Tracker._colours(follow, frame, nothing, J, radius)
-    information = 1.0 / tracker.REGION_VARIANCE - 3.0 / radius**2
-    expected = [tracker.REGION_WEIGHT * information, 0.0, 0.0]
+    information = 1.0 / tracking.REGION_VARIANCE - 3.0 / radius**2
+    expected = [tracking.REGION_WEIGHT * information, 0.0, 0.0]
     assert colours.weight.flatten().tolist() == pytest.approx(expected)
     assert colours.distance.flatten().tolist() == mean.tolist()
     assert colours.J is J

@@ -20,10 +20,10 @@ from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.pipeline import Pipeline
-from curvireg_torch.registration import focal, unknown_camera
+from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.block import Block
 from curvireg_torch.registration.hypotheses import Hypotheses
-from curvireg_torch.registration.inputs import ImageItem
+from curvireg_torch.registration.photograph import ImageItem
 from tests._support.scenes import CAMERA, SIZE
 
 NOTHING: Any = None
@@ -46,20 +46,22 @@ def evidence_of(*similarity: float) -> Evidence:
 
 
 def test_cameras_that_are_tried_have_all_fields_of_view():
-    cameras = focal.possible_cameras((480, 640))
+    cameras = camera_module.possible_cameras((480, 640))
     fields_of_view = [2.0 * math.degrees(math.atan(320.0 / float(K[0, 0]))) for K in cameras]
-    assert fields_of_view == pytest.approx(focal.FIELDS_OF_VIEW)
-    assert list(focal.FIELDS_OF_VIEW) == sorted(set(focal.FIELDS_OF_VIEW))
+    assert fields_of_view == pytest.approx(camera_module.FIELDS_OF_VIEW)
+    assert list(camera_module.FIELDS_OF_VIEW) == sorted(set(camera_module.FIELDS_OF_VIEW))
     assert fields_of_view[0] < 15.0
     assert fields_of_view[-1] > 80.0
-    assert float(focal.usual_camera((480, 640))[0, 0]) == pytest.approx(USUAL_FOCAL * 640)
+    assert float(camera_module.usual_camera((480, 640))[0, 0]) == pytest.approx(USUAL_FOCAL * 640)
 
 
 def test_the_angle_to_the_centre_of_the_box():
     K = CAMERA.clone()
     box = torch.tensor([119.5 + 100, 89.5 - 20, 119.5 + 160, 89.5 + 20])
     item = ImageItem(torch.zeros(3, *SIZE), box, K)
-    assert focal.off_axis_angle(item) == pytest.approx(math.degrees(math.atan(130.0 / 260.0)))
+    assert camera_module.off_axis_angle(item) == pytest.approx(
+        math.degrees(math.atan(130.0 / 260.0))
+    )
 
 
 def test_starts_are_the_best_view_of_each_camera_and_the_best_views():
@@ -68,11 +70,11 @@ def test_starts_are_the_best_view_of_each_camera_and_the_best_views():
         [[0.20, 0.30, 0.10, 0.10], [0.50, 0.10, 0.45, 0.10], [0.10, 0.15, 0.10, 0.40]]
     ).double()
     ranked = support * 20.0 - torch.arange(4)
-    found = [divmod(place, 4) for place in focal.best_of_fields(ranked, 2).tolist()]
+    found = [divmod(place, 4) for place in camera_module.best_of_fields(ranked, 2).tolist()]
     # the best view of each camera, and the third view with its best camera, the second best of all
     expected = [(1, 0), (1, 2), (0, 1), (2, 3)]
     assert found == sorted(expected, key=lambda place: -float(ranked[place]))
-    every = focal.best_of_fields(ranked, 4)
+    every = camera_module.best_of_fields(ranked, 4)
     assert sorted((every % 4).tolist()) == [0, 1, 2, 3]
 
 
@@ -92,13 +94,13 @@ def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source
     def measured(_: Any, __: Any, support: Tensor, ___: Tensor) -> Any:
         return replace(poses.fit, edge_support=support.double())
 
-    monkeypatch.setattr(focal.ContourProblem, "of", problem)
-    monkeypatch.setattr(focal, "fit_focal_length", fit)
-    monkeypatch.setattr(focal, "measured_fit", measured)
+    monkeypatch.setattr(camera_module.ContourProblem, "of", problem)
+    monkeypatch.setattr(camera_module, "fit_focal_length", fit)
+    monkeypatch.setattr(camera_module, "measured_fit", measured)
     describer: Any = SimpleNamespace(contours=None, centre=CENTRE)
     item = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA)
     item = replace(item, camera_source=source, focal_deviation=0.1)
-    found = focal.with_focal_length(describer, NOTHING, poses, item)
+    found = camera_module.with_focal_length(describer, NOTHING, poses, item)
     assert fitted == factors
     zoom = float(found.cameras[0, 0, 0] / CAMERA[0, 0])
     assert zoom == pytest.approx(math.exp(0.1 * len(factors)))
@@ -112,13 +114,13 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
     none = torch.ones(1, dtype=torch.float64)
     information = FocalInformation(amount=none, scale=0.04 * none, step=none)
     problem = SimpleNamespace(state=lambda _: None)
-    monkeypatch.setattr(focal.ContourProblem, "of", lambda *_: problem)
-    monkeypatch.setattr(focal, "focal_information", lambda *_: (information, motion))
+    monkeypatch.setattr(camera_module.ContourProblem, "of", lambda *_: problem)
+    monkeypatch.setattr(camera_module, "focal_information", lambda *_: (information, motion))
     describer: Any = SimpleNamespace(contours=None, centre=CENTRE)
     item = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA)
     item = replace(item, focal_deviation=0.2)
-    covariance, deviation = focal.focal_covariance(describer, NOTHING, pose, item)
-    measured = focal.REPORTED_VARIANCE * 0.04
+    covariance, deviation = camera_module.focal_covariance(describer, NOTHING, pose, item)
+    measured = camera_module.REPORTED_VARIANCE * 0.04
     variance = 1.0 / (1.0 / measured + 1.0 / 0.2**2)
     assert deviation == pytest.approx(math.sqrt(variance))
     step = 1e-6
@@ -152,8 +154,8 @@ def refitted(
     def measure(_: Any, __: Any, some: Hypotheses) -> Hypotheses:
         return replace(some, evidence=evidence_of(*[new[view] for view in some.view.tolist()]))
 
-    monkeypatch.setattr(unknown_camera, "with_focal_length", fit)
-    monkeypatch.setattr(unknown_camera, "with_evidence", measure)
+    monkeypatch.setattr(camera_module, "with_focal_length", fit)
+    monkeypatch.setattr(camera_module, "with_evidence", measure)
     target: Any = SimpleNamespace(
         score_weights=lambda **_: EvidenceWeights(),
         describer=SimpleNamespace(centre=CENTRE),
@@ -167,7 +169,7 @@ def refitted(
     )
     excluded = torch.tensor(outside or [False] * len(poses))
     before = replace(poses, evidence=evidence, is_outside=excluded)
-    after = unknown_camera.with_fitted_focal_lengths(target, block, NOTHING, before)
+    after = camera_module.with_fitted_focal_lengths(target, block, NOTHING, before)
     differ = (after.cameras != poses.cameras).flatten(1).any(dim=1)
     return tried, differ.nonzero()[:, 0].tolist(), after.evidence
 
@@ -193,11 +195,11 @@ def test_fits_also_begin_from_the_focal_length_of_another_pose():
     """If it differs by more than 0.2 of log f; the first pose from that of the second such."""
     focal_lengths = 500.0 * torch.tensor([1.0, 1.1, 1.3, 0.7]).double()
     chosen = torch.tensor([0, 1, 2, 3])
-    index, starts = unknown_camera._focal_starts(chosen, focal_lengths)
+    index, starts = camera_module._focal_starts(chosen, focal_lengths)
     assert index.tolist() == [0, 1, 2, 3, 0, 2, 3]
     assert starts.tolist() == pytest.approx([500.0, 550.0, 650.0, 350.0, 650.0, 500.0, 500.0])
     alone = torch.tensor([2])
-    assert unknown_camera._focal_starts(alone, focal_lengths)[0].tolist() == [2]
+    assert camera_module._focal_starts(alone, focal_lengths)[0].tolist() == [2]
 
 
 def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(monkeypatch):
@@ -208,14 +210,14 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
         covariance=torch.ones(3, 6, 6, dtype=torch.float64),
     )
     best = torch.full((1, 6, 6), 2.0, dtype=torch.float64)
-    monkeypatch.setattr(unknown_camera, "focal_covariance", lambda *_: (best, 0.07))
+    monkeypatch.setattr(camera_module, "focal_covariance", lambda *_: (best, 0.07))
     target: Any = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), describer=None)
     item = replace(ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA), focal_deviation=0.1)
     given: dict[str, Any] = {field.name: None for field in fields(Block)}
     block = Block(**given | {"photographs": [item]})
     outside = torch.tensor([False, False, True])
     before = replace(poses, evidence=evidence_of(0.7, 0.8, 0.9), is_outside=outside)
-    block, after = unknown_camera.with_focal_deviation(target, block, NOTHING, before)
+    block, after = camera_module.with_focal_deviation(target, block, NOTHING, before)
     (photograph,) = block.photographs
     assert photograph.focal_deviation == 0.07
     assert torch.equal(photograph.camera_matrix, poses.cameras[1])
@@ -230,19 +232,19 @@ def test_limits_of_an_unknown_camera_are_wider_by_how_far_the_box_is_off_the_axi
         made.append((item.camera_matrix, off_centre))
         return "limits"
 
-    monkeypatch.setattr(unknown_camera, "Limits", limits)
+    monkeypatch.setattr(camera_module, "Limits", limits)
     prior: Any = SimpleNamespace(distance=None)
     known = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA, prior)
     unknown = replace(known, camera_matrix=None)
     target: Any = SimpleNamespace(bank=None, is_exact=True)
     similar: Any = SimpleNamespace(bank=None, is_exact=False)
     for one, item in ((target, known), (target, unknown), (similar, unknown)):
-        assert unknown_camera.limits_of(one, item) == "limits"
+        assert camera_module.limits_of(one, item) == "limits"
     (first, none), (usual, off), (last, also_none) = made
     assert torch.equal(first, CAMERA)
     assert (none, also_none, last) == (0.0, 0.0, None)
-    assert torch.equal(usual, focal.usual_camera(SIZE))
-    assert off == pytest.approx(focal.off_axis_angle(replace(known, camera_matrix=usual)))
+    assert torch.equal(usual, camera_module.usual_camera(SIZE))
+    assert off == pytest.approx(camera_module.off_axis_angle(replace(known, camera_matrix=usual)))
     with_distance: Any = SimpleNamespace(distance=(1.0, 2.0))
     with pytest.raises(InvalidInputError, match="distance"):
-        unknown_camera.limits_of(similar, replace(unknown, prior=with_distance))
+        camera_module.limits_of(similar, replace(unknown, prior=with_distance))

@@ -6,12 +6,12 @@ import torch
 
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import object_frame
-from curvireg_torch.registration.words import (
+from curvireg_torch.registration.confidence import two_decimals
+from curvireg_torch.visualization.words import (
     AXIS_ALONE,
     VERDICTS,
     pose_in_words,
     remarks,
-    two_decimals,
     verdict_counts,
 )
 

@@ -8,8 +8,8 @@ import torch
 
 pytest.importorskip("sklearn")
 
+from curvireg_torch.geometry.framing import outside_fraction
 from curvireg_torch.mesh import has_colours
-from curvireg_torch.registration.framing import outside_fraction
 from curvireg_torch.synthetic import example_mesh
 from scripts.benchmark.make import TWIN, Shapes, Tied, Twins
 from scripts.calibration import fits, measure, sets

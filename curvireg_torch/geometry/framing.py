@@ -7,15 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..geometry.cameras import project_points
-from ..geometry.crops import crop_transforms, image_transforms, square_boxes
-from ..pipeline import BankSettings
+from .cameras import boxes_around, project_points, projected
+from .crops import crop_transforms, image_transforms, square_boxes
 
 BORDER = 1.5  # Pixels from the border within which a side of a box lies on it
 # By how much an object may go on beyond the border, as fractions of what is visible of it
 EXTENSIONS = (0.4, 1.2)
-# Fraction of the object outside the photograph from which a result carries a warning
-MUCH_OUTSIDE = 0.1
 
 
 def photograph_box(size: tuple[int, int]) -> Tensor:
@@ -87,10 +84,10 @@ class CropFrame:
     inside: Tensor
 
     @classmethod
-    def of(cls, box: Tensor, size: tuple[int, int], settings: BankSettings) -> "CropFrame":
-        """The frame of a box (4,) in a photograph of ``size`` (H, W)."""
-        side = settings.image_size
-        square = square_boxes(box.double(), settings.margin)
+    def of(cls, box: Tensor, size: tuple[int, int], *, side: int, margin: float) -> "CropFrame":
+        """The frame of the crop of a box (4,), with a ``margin`` around it, to ``side`` px, in a
+        photograph of ``size`` (H, W)."""
+        square = square_boxes(box.double(), margin)
         to_photograph = image_transforms(square, side)
         pixels = torch.arange(side, dtype=torch.float64)
         x = to_photograph[0, 0] * pixels + to_photograph[0, 2]
@@ -134,11 +131,12 @@ def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) 
     return min(max(1.0 - float(inside) / whole, 0.0), 1.0)
 
 
-def outside_warnings(fraction: float) -> tuple[str, ...]:
-    """What is questionable about a photograph that does not show a ``fraction`` of the object."""
-    if fraction < MUCH_OUTSIDE:
-        return ()
-    return (
-        f"{100 * fraction:.0f} % of the object lies outside the photograph; take one that shows "
-        f"all of it",
-    )
+def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """(N, 4) boxes in px around a mesh with ``hull`` (V, 3) at poses (N, 4, 4), in an image of
+    ``size`` (H, W). And (N,) bool, False where the mesh lies behind the camera, or outside the
+    image: there the box means nothing."""
+    depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
+    boxes = boxes_around(projected(hull, T, K))
+    limits = torch.tensor([size[1], size[0]], dtype=boxes.dtype) - 0.5
+    outside = (boxes[:, :2] >= limits) | (boxes[:, 2:] <= -0.5) | (depth <= 0)[:, None]
+    return boxes, ~outside.any(dim=1)

@@ -21,6 +21,7 @@ from ..errors import CurviregError, ImageError, InvalidInputError
 from ..formats.masks import mask_of_values, read_mask
 from ..geometry.calibration import Camera, undistorted
 from ..geometry.crops import box_iou, check_boxes, crop_squares, square_boxes, whole_image_box
+from ..geometry.framing import clipped
 from ..geometry.pose_prior import PosePrior
 from ..utils.checks import (
     are_nearly_equal,
@@ -37,7 +38,6 @@ from ..utils.checks import (
     type_and_shape,
 )
 from ..utils.likes import ArrayLike, BoxesLike, BoxLike, CameraLike, ImageLike, ImagesLike, MaskLike
-from .framing import clipped
 
 # Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of
 # 0.98.

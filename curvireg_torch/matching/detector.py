@@ -12,15 +12,13 @@ from ..features.backbone import STRIDES, Backbone
 from ..filters.operations import resized
 from ..geometry.crops import crop_transforms, non_maximum_suppression, square_boxes
 from ..geometry.pose_prior import check_distance
-from ..matching import ViewBank, ViewMatcher
 from ..utils.checks import check_photograph, check_pixels
+from . import ViewBank, ViewMatcher
 
 TEMPLATE_SIDE = 96  # Side of the template views in px
 SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
 SAME_OBJECT_OVERLAP = 0.5  # Intersection over union from which boxes show the same object
 MIN_OBJECT_SIDE = 32.0  # Longer side in px of the smallest object that can be recognised
-MIN_REGISTERED = 2  # Places that are registered at least, as a fitted pose tells more than its box
-FOUND_CONFIDENCE = 0.1  # Confidence below which the object counts as not found
 MAX_PEAKS = 500  # Best peaks of a photograph that boxes are selected from
 # Largest number of views, evenly spread over the bank, whose pairwise distances are computed
 MAX_COMPARED_VIEWS = 1500

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 
 from ..mesh.mesh import mesh_unit
+from ..registration.result import Detection, Registration
+from ..registration.target import Target
 from ..version import __version__
-from .result import Detection, Registration
-from .target import Target
 
 # Version of the keys of result.json; raised when a key is removed or changes its meaning
 SCHEMA = 5

@@ -5,10 +5,10 @@ from torch import Tensor
 
 from ..geometry import ViewSphere, rotation_from_viewpoint, viewpoint_from_rotation
 from ..geometry.viewpoint import PAPER_RADIUS
-from ..matching import Ranking, ViewBank, ViewMatcher
-from ..matching.bank import view_frame
 from ..mesh import mesh_radius
 from ..terms import QueryFeatures
+from . import Ranking, ViewBank, ViewMatcher
+from .bank import view_frame
 
 BEST_VIEWS = 3  # "at least the highest three correspondences"
 # |T_i^-1 T_(i+1) - Id|_F at which the search stops, translation in object radii (METHOD 6)

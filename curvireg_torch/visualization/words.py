@@ -19,16 +19,6 @@ STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from
 WEAK_PERSPECTIVE = 0.15
 
 
-def two_decimals(probability: float) -> str:
-    """A probability as it is shown, never rounded up: 0.897 is not yet 0.90, reliable.
-
-    Example:
-        >>> two_decimals(0.897), two_decimals(0.29), two_decimals(1.0)
-        ('0.89', '0.29', '1.00')
-    """
-    return f"{math.floor(100.0 * probability + 1e-9) / 100.0:.2f}"
-
-
 def corners(box: Sequence[float]) -> str:
     """A box in whole px, as ``--box`` takes it."""
     return " ".join(f"{v:.0f}" for v in box)
