@@ -18,7 +18,7 @@ from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputEr
 from curvireg_torch.jobs.lists import find_photographs, read_list
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.mesh import has_colours, mesh_symmetries, mesh_warnings
-from curvireg_torch.registration.photograph import FRACTIONS, image_items
+from curvireg_torch.registration.photograph import FRACTIONS, as_photographs
 from curvireg_torch.registration.refinement import why_outside
 from curvireg_torch.utils.extras import is_installed
 
@@ -76,7 +76,7 @@ def test_calibrations_that_need_a_choice():
 
 def test_boxes_in_fractions_are_named():
     photo = real_case("b01-yolo-normalised") / "photo.jpg"
-    item = image_items([photo], [[0.3, 0.2, 0.7, 0.9]], DINO_CAMERA)[0]
+    item = as_photographs([photo], [[0.3, 0.2, 0.7, 0.9]], DINO_CAMERA)[0]
     assert isinstance(item, InvalidInputError)
     assert item.message == FRACTIONS
 
@@ -311,10 +311,10 @@ def test_a_photograph_of_a_phone_and_a_step_file_know_camera_and_unit():
 def test_a_matrix_of_the_picture_at_half_size_is_named():
     camera = cr.load_camera(real_case("n73-camera-of-half-the-size") / "cam_K.txt")
     folder = real_case("lamp")
-    item = image_items([folder / "photo.jpg"], [[334, 146, 711, 573.5]], [camera])[0]
+    item = as_photographs([folder / "photo.jpg"], [[334, 146, 711, 573.5]], [camera])[0]
     assert any("seems to be of a picture of 480 x 360" in text for text in item.warnings)
     of_photograph = cr.camera_matrix(1100, 1100, 479.5, 359.5)
-    item = image_items([folder / "photo.jpg"], [[334, 146, 711, 573.5]], [of_photograph])[0]
+    item = as_photographs([folder / "photo.jpg"], [[334, 146, 711, 573.5]], [of_photograph])[0]
     assert not item.warnings
 
 

@@ -50,7 +50,7 @@ SIDES = (6, 32)  # of prisms and cylinders
 
 
 @dataclass(frozen=True)
-class Photograph:
+class GeneratedPhotograph:
     """A generated photograph: (3, H, W) uint8, its box (4,) in px, the true pose (4, 4), the camera
     matrix (3, 3), and its number."""
 
@@ -92,7 +92,7 @@ class PhotographGenerator:
     backgrounds: Sequence[Tensor] = ()
     clutter: bool = False
 
-    def __call__(self, index: int) -> Photograph:
+    def __call__(self, index: int) -> GeneratedPhotograph:
         """Photograph number ``index``."""
         K = trial_camera()
         mesh = photographed_mesh(self.mesh)
@@ -111,7 +111,7 @@ class PhotographGenerator:
         blur = BLUR * float(torch.rand((), generator=generator))
         if blur > SHARP:
             image = gaussian_smooth(image[None], blur)[0]
-        return Photograph(to_bytes(image), _wrong_box(box, generator), truth, K, index)
+        return GeneratedPhotograph(to_bytes(image), _wrong_box(box, generator), truth, K, index)
 
 
 def trial_camera() -> Tensor:

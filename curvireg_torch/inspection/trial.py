@@ -26,7 +26,7 @@ from ..synthetic import synthesize_photograph
 from ..utils.threads import map_on_threads
 from .photographs import (
     SIZE,
-    Photograph,
+    GeneratedPhotograph,
     PhotographGenerator,
     photographed_mesh,
     to_bytes,
@@ -58,7 +58,7 @@ class Outcome:
     """The answer for a generated photograph: rotation error up to symmetries, and what the
     registration says."""
 
-    photograph: Photograph
+    photograph: GeneratedPhotograph
     result: Registration | None
     error_deg: float
     elevation: float
@@ -139,7 +139,7 @@ class Trial:
 
 def run_trial(
     registrar: Registrar,
-    generate: Callable[[int], Photograph],
+    generate: Callable[[int], GeneratedPhotograph],
     count: int,
     *,
     with_camera: bool = True,
@@ -216,12 +216,14 @@ class _Setup:
     def mesh(self) -> trimesh.Trimesh:
         return self.registrar.bank.mesh
 
-    def register(self, photograph: Photograph, *, prior: PosePrior | None = None) -> Outcome:
+    def register(
+        self, photograph: GeneratedPhotograph, *, prior: PosePrior | None = None
+    ) -> Outcome:
         camera = photograph.camera if self.with_camera else None
         found = self.registrar([photograph.image], photograph.box[None], camera, prior=prior)[0]
         return self.outcome(photograph, found if isinstance(found, Registration) else None)
 
-    def register_with_hint(self, photograph: Photograph) -> Outcome:
+    def register_with_hint(self, photograph: GeneratedPhotograph) -> Outcome:
         """The outcome with a pose that a user has set by hand, some degrees off."""
         generator = _generator(photograph)
         axis = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
@@ -229,7 +231,7 @@ class _Setup:
         rotation = rotation_from_axis_angle(angle * axis) @ photograph.truth[:3, :3]
         return self.register(photograph, prior=PosePrior(rotation=rotation, within=HINT_DEGREES))
 
-    def register_with_second(self, photograph: Photograph) -> Outcome:
+    def register_with_second(self, photograph: GeneratedPhotograph) -> Outcome:
         """The outcome of a photograph and a second one, of a camera to its side."""
         K = photograph.camera
         turn = rotation_from_axis_angle(
@@ -249,7 +251,7 @@ class _Setup:
             return self.outcome(photograph, None)
         return self.outcome(photograph, found)
 
-    def outcome(self, photograph: Photograph, result: Registration | None) -> Outcome:
+    def outcome(self, photograph: GeneratedPhotograph, result: Registration | None) -> Outcome:
         """The outcome of a registration; without a camera, rotations are compared as a camera that
         looks at the object sees them."""
         truth = photograph.truth[:3, :3]
@@ -316,6 +318,6 @@ def viewpoint_of(mesh: trimesh.Trimesh, rotation: Tensor) -> tuple[Tensor, Tenso
     return viewpoint_from_rotation(rotation @ up_rotation(mesh_up(mesh)).double().mT)
 
 
-def _generator(photograph: Photograph) -> torch.Generator:
+def _generator(photograph: GeneratedPhotograph) -> torch.Generator:
     """Of what is drawn for another condition of a photograph."""
     return torch.Generator().manual_seed(int(1000 * photograph.box.sum().abs()))

@@ -16,7 +16,7 @@ from ..formats.masks import mask_as_shown, mask_file
 from ..geometry import Camera, camera_matrix
 from ..geometry.cameras import camera_of_view
 from ..geometry.pose_prior import PosePrior
-from ..registration.photograph import ImageItem, image_items
+from ..registration.photograph import Photograph, as_photographs
 from ..utils.choices import UNITS
 from ..utils.files import file_digest, text_digest
 from ..utils.likes import BoxLike
@@ -123,7 +123,7 @@ class Observation:
     photo: Photo
     camera: Camera | None
     camera_source: str | None
-    item: ImageItem
+    item: Photograph
     seconds: float
 
 
@@ -137,7 +137,7 @@ def observe(entry: Entry, photo: Photo) -> Observation:
     H, W = photo.image.shape[-2:]
     mask = mask_as_shown(entry.mask, PictureSize((H, W), photo.orientation))
     boxes, masks = (None if given is None else [given] for given in (entry.box, mask))
-    item = image_items([photo.image], boxes, camera, entry.prior, masks)[0]
+    item = as_photographs([photo.image], boxes, camera, entry.prior, masks)[0]
     if isinstance(item, CurviregError):
         raise item.with_subject(entry.name)
     seconds = time.perf_counter() - start

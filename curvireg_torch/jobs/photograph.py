@@ -23,10 +23,10 @@ from ..mesh import load_mesh
 from ..mesh.mesh import mesh_unit
 from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar, Registration
-from ..registration.detection import detect_items
+from ..registration.detection import detect_prepared
 from ..registration.hypotheses import projected_box
-from ..registration.photograph import image_item
-from ..registration.refinement import refine_items
+from ..registration.photograph import as_photograph
+from ..registration.refinement import refine_prepared
 from ..registration.registrar import ObjectLike, Results
 from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike
 from ..visualization import contour_overlay, plots
@@ -155,7 +155,7 @@ def register(
         photo = (
             photo_of_picture(image)
             if isinstance(image, Image.Image)
-            else Photo(image_item(image, None).image, 1, None, ())
+            else Photo(as_photograph(image, None).image, 1, None, ())
         )
     if isinstance(camera, str | PathLike):
         camera = camera if camera == "exif" else load_camera(camera)
@@ -216,7 +216,7 @@ def register_observations(
     items = [observations[place].item for place in located]
     results: dict[int, Results] = {
         place: [result]
-        for place, result in zip(located, registrar.register_items(items), strict=True)
+        for place, result in zip(located, registrar.register_prepared(items), strict=True)
     }
     seconds = (time.perf_counter() - start) / max(len(located), 1)
     found: list[RegisteredPhotograph | CurviregError] = []
@@ -242,7 +242,7 @@ def _results_of(observation: Observation, registrar: Registrar) -> Results:
         start_pose = start_in_unit(entry.start, mesh_unit(registrar.bank.mesh))
         confidences = [entry.start.confidence]
         alone = replace(item, prior=None)
-        return refine_items(registrar, [alone], [start_pose], start_confidences=confidences)
+        return refine_prepared(registrar, [alone], [start_pose], start_confidences=confidences)
     if entry.views:
         assert camera is not None  # of datasets with cameras only
         world = torch.eye(4, dtype=torch.float64)
@@ -255,8 +255,8 @@ def _results_of(observation: Observation, registrar: Registrar) -> Results:
         )
         return [replace(together, hypotheses=(best, *others))]
     if entry.instances > 1:
-        return detect_items(registrar, [item], instances=entry.instances)[0]
-    return registrar.register_items([item], detects=True)
+        return detect_prepared(registrar, [item], instances=entry.instances)[0]
+    return registrar.register_prepared([item], detects=True)
 
 
 def _registered(

@@ -24,7 +24,7 @@ from ..mesh import mesh_up
 from ..mesh.mesh import mesh_centre, mesh_radius
 from ..terms import Appearance, QueryFeatures
 from .hypotheses import Hypotheses, fit_poses, placed
-from .photograph import ImageItem
+from .photograph import Photograph
 from .target import Target, nearest_view
 
 # Degrees by which the limits are widened for views of a bank: each stands for the poses up to
@@ -47,7 +47,7 @@ class Limits:
     matrix, in one that looks straight at the box. Views are allocentric, and are rotated towards
     the ray through the centre of the box, which is known to ``off_centre`` degrees."""
 
-    def __init__(self, item: ImageItem, bank: ViewBank, *, off_centre: float = 0.0) -> None:
+    def __init__(self, item: Photograph, bank: ViewBank, *, off_centre: float = 0.0) -> None:
         assert item.prior is not None
         self._off_centre = off_centre
         self.prior = item.prior
@@ -300,7 +300,7 @@ class Block(Described):
         tried_cameras: (P,) bool, photographs whose camera is unknown: their starts have several.
     """
 
-    photographs: Sequence[ImageItem]
+    photographs: Sequence[Photograph]
     limits: Sequence[Limits | None]
     exact: bool
     symmetries: Tensor | None
@@ -321,7 +321,7 @@ class Block(Described):
         given = [photograph.camera_matrix for photograph in self.photographs]
         return torch.stack([unknown if K is None else K.double() for K in given])
 
-    def with_photographs(self, changed: dict[int, ImageItem]) -> "Block":
+    def with_photographs(self, changed: dict[int, Photograph]) -> "Block":
         """The block with other photographs in some places."""
         photographs = [changed.get(p, one) for p, one in enumerate(self.photographs)]
         return replace(self, photographs=photographs)

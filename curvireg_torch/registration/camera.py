@@ -34,7 +34,7 @@ from ..rendering.contours import MeshContours
 from .block import Block, Limits, least_starts, poses_of_views, with_evidence
 from .confidence import are_near
 from .hypotheses import Hypotheses, best_views, close_rivals, placed, with_short_fit
-from .photograph import ImageItem
+from .photograph import Photograph
 from .result import Registration
 from .target import Target
 
@@ -74,7 +74,7 @@ def possible_cameras(size: tuple[int, int]) -> list[Tensor]:
     return [_camera(size, 0.5 * max(size) / math.tan(angle)) for angle in half]
 
 
-def off_axis_angle(item: ImageItem) -> float:
+def off_axis_angle(item: Photograph) -> float:
     """Degrees between the optical axis and the ray through the centre of a photograph's box."""
     x, y = ((item.box[:2] + item.box[2:]).double() / 2.0 - item.K[:2, 2]).tolist()
     return math.degrees(math.atan(math.hypot(x, y) / float(item.K[0, 0])))
@@ -100,7 +100,7 @@ def best_of_fields(evidence: Tensor, count: int) -> Tensor:
     return started
 
 
-def focal_prior(item: ImageItem, cameras: Tensor) -> FocalPrior:
+def focal_prior(item: Photograph, cameras: Tensor) -> FocalPrior:
     """What is known of the focal length of a photograph's camera; ``cameras`` (N, 3, 3) are where
     fits begin."""
     if item.camera_source == "estimated":
@@ -111,7 +111,7 @@ def focal_prior(item: ImageItem, cameras: Tensor) -> FocalPrior:
 
 
 def with_focal_length(
-    describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses, item: ImageItem
+    describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses, item: Photograph
 ) -> Hypotheses:
     """Hypotheses of a photograph fitted at full size together with their focal lengths."""
     T = poses.T
@@ -139,7 +139,7 @@ def zoomed(poses: Hypotheses, focal: Tensor, centre: Tensor) -> Hypotheses:
 
 
 def focal_covariance(
-    describer: ViewDescriber, crops: EdgeCrops, pose: Hypotheses, item: ImageItem
+    describer: ViewDescriber, crops: EdgeCrops, pose: Hypotheses, item: Photograph
 ) -> tuple[Tensor, float]:
     """(1, 6, 6) covariance of one fitted pose with the error of its focal length, and the standard
     deviation of that, as a fraction."""
@@ -181,7 +181,7 @@ SAME_SCORE = 0.2
 support."""
 
 
-def limits_of(target: Target, item: ImageItem) -> Limits:
+def limits_of(target: Target, item: Photograph) -> Limits:
     """The limits of a photograph that has any; an unknown camera counts as a usual one, and widens
     them."""
     assert item.prior is not None

@@ -23,9 +23,9 @@ from .block import keypoint_poses
 from .camera import limits_of, usual_camera
 from .confidence import detection_probability, two_decimals
 from .hypotheses import projected_box
-from .photograph import ImageItem, check_crop, image_items
+from .photograph import Photograph, as_photographs, check_crop
 from .result import Detection, FailedRegistration, Registration
-from .stages import map_items, register
+from .stages import map_photographs, register
 from .target import Target
 
 MIN_REGISTERED = 2  # Places that are registered at least, as a fitted pose tells more than its box
@@ -69,24 +69,24 @@ def detect(
         >>> len(found) >= 1
         True
     """
-    items = image_items(images, None, camera_matrices, prior)
-    return detect_items(target, items, instances=instances)
+    items = as_photographs(images, None, camera_matrices, prior)
+    return detect_prepared(target, items, instances=instances)
 
 
 @torch.no_grad()
-def detect_items(
-    target: Target, items: Sequence[ImageItem | CurviregError], *, instances: int = 1
+def detect_prepared(
+    target: Target, items: Sequence[Photograph | CurviregError], *, instances: int = 1
 ) -> list[Results]:
-    """:func:`detect` in photographs that :func:`.image_items` has prepared."""
+    """:func:`detect` in photographs that :func:`.as_photographs` has prepared."""
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
-    found = map_items(
-        items, lambda item, index: detect_item(target, item, index, instances=instances)
+    found = map_photographs(
+        items, lambda item, index: detect_one(target, item, index, instances=instances)
     )
     return [[one] if isinstance(one, FailedRegistration) else one for one in found]
 
 
-def detect_item(target: Target, item: ImageItem, index: int, *, instances: int = 1) -> Results:
+def detect_one(target: Target, item: Photograph, index: int, *, instances: int = 1) -> Results:
     """:func:`detect` in one photograph, the ``index``-th one; its box does not matter."""
     target.report_progress("detection")
     proposals = propose(target, item)
@@ -100,7 +100,7 @@ def detect_item(target: Target, item: ImageItem, index: int, *, instances: int =
     return [*convincing] or [_lost(found, index)]
 
 
-def propose(target: Target, item: ImageItem) -> "Proposals":
+def propose(target: Target, item: Photograph) -> "Proposals":
     """Boxes in which a photograph may show the object: those around poses on which keypoints of its
     print agree, their number being the response, and those of the detector."""
     extremes = torch.stack(
@@ -143,7 +143,7 @@ def _lost(found: Sequence[Registration], index: int) -> FailedRegistration:
     return FailedRegistration(error)
 
 
-def _allowed_views(target: Target, item: ImageItem) -> Tensor:
+def _allowed_views(target: Target, item: Photograph) -> Tensor:
     """(N,) bool: views of the bank that the prior does not exclude everywhere in the photograph,
     which is the box."""
     off_centre = 0.0
@@ -178,7 +178,7 @@ class Candidate:
     def compared(
         cls,
         target: Target,
-        item: ImageItem,
+        item: Photograph,
         box: Tensor,
         response: float,
         rival: float | None,
@@ -192,7 +192,7 @@ class Candidate:
         score = detection_probability(response, similarity, rival=rival)
         return cls(box, response, rival, query, score)
 
-    def register(self, target: Target, item: ImageItem) -> "Found":
+    def register(self, target: Target, item: Photograph) -> "Found":
         (result,) = register(target, [replace(item, box=self.box.float())], self.query)
         box = projected_box(target.describer, result.projection)
         return Found(result, box, self.response, self.rival, self.score)
@@ -218,7 +218,7 @@ class Found:
 
 
 def _register_candidates(
-    target: Target, item: ImageItem, proposals: Proposals, instances: int
+    target: Target, item: Photograph, proposals: Proposals, instances: int
 ) -> list[Found]:
     """The most probable objects, at most ``instances``, whose boxes do not overlap; the error of
     the best if there is none."""
@@ -244,7 +244,7 @@ def _register_candidates(
     return sorted(found, key=lambda one: one.probability, reverse=True)[:instances]
 
 
-def _refined(target: Target, item: ImageItem, found: Found) -> Found:
+def _refined(target: Target, item: Photograph, found: Found) -> Found:
     """The more certain one of a registration and of that of the box around its pose."""
     try:
         candidate = Candidate.compared(target, item, found.box, found.response, found.rival)

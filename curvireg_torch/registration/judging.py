@@ -39,7 +39,7 @@ from .confidence import (
     undetermined_axes,
 )
 from .hypotheses import Hypotheses, hypothesis_of, placed, with_short_fit
-from .photograph import ImageItem
+from .photograph import Photograph
 from .result import (
     AXIS_TOLERANCE,
     DETERMINING_KEYPOINTS,
@@ -244,7 +244,7 @@ def _near_best(block: Block, poses: Hypotheses) -> Tensor:
     return torch.where(is_sibling | is_sibling[0], are_near(R, R[0]), near)
 
 
-def _outside_fraction(target: Target, item: ImageItem, best: Hypotheses) -> float:
+def _outside_fraction(target: Target, item: Photograph, best: Hypotheses) -> float:
     """Fraction of the object that lies outside the photograph at the ``best`` pose."""
     return outside_fraction(target.describer.hull, best.T[0], best.cameras[0], item.size)
 
@@ -475,7 +475,7 @@ DETAILED = 5.0
 def best_of_meshes(
     results: Sequence[Registration | FailedRegistration],
     targets: Sequence[Target],
-    item: ImageItem | None = None,
+    item: Photograph | None = None,
 ) -> Registration | FailedRegistration:
     """The best of the results of several meshes for one photograph, the ``item``; None for several
     photographs together, which are not compared in detail.
@@ -529,7 +529,7 @@ def _compared_in_detail(
     scores: Sequence[Tensor],
     found: Sequence[Registration],
     targets: Sequence[Target],
-    item: ImageItem,
+    item: Photograph,
 ) -> list[Tensor]:
     """The scores of each mesh's poses, moved by how far the contours that only its best pose
     predicts speak for it, beside the best mesh."""
@@ -552,7 +552,7 @@ def _compared_in_detail(
     return moved
 
 
-def _details_of(target: Target, result: Registration, item: ImageItem) -> ContourDetails:
+def _details_of(target: Target, result: Registration, item: Photograph) -> ContourDetails:
     """What the contours of a mesh's best pose are compared by, in the box of the photograph that
     was given, or in which the object was found."""
     box = item.box if result.detection is None else result.detection.box.float()

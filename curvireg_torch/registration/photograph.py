@@ -66,13 +66,13 @@ MISSING_SHARE = 0.2
 
 
 @dataclass(frozen=True)
-class ImageItem:
+class Photograph:
     """One photograph to register, without distortion: ``image`` (1 or 3, H, W) float or uint8,
     ``box`` (4,), ``camera_matrix`` (3, 3), ``mask`` (H, W) float32 in [0, 1] of the object, and
     what is questionable about them; ``focal_deviation`` and ``camera_source`` as in
     :class:`Camera`.
 
-    What strangers give is checked by ``image_item``, once.
+    What strangers give is checked by ``as_photograph``, once.
     """
 
     image: Tensor
@@ -139,13 +139,13 @@ class ImageItem:
         )
 
 
-def image_items(
+def as_photographs(
     images: ImagesLike,
     boxes: BoxesLike | None,
     camera_matrices: CameraLike | None,
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
     masks: Sequence[MaskLike | None] | Tensor | None = None,
-) -> Sequence[ImageItem | CurviregError]:
+) -> Sequence[Photograph | CurviregError]:
     """Photographs with boxes (None: those of the masks, or the whole images), cameras and masks, or
     their errors. Arguments and errors are those of ``Registrar``; each is read and checked whenever
     it is asked for, so that many large files need the memory of few. A :class:`Camera` is scaled to
@@ -178,10 +178,10 @@ def image_items(
             f"prior: expected a PosePrior, or a list of {n} with None where there is none"
         )
 
-    def item(i: int) -> ImageItem | CurviregError:
+    def item(i: int) -> Photograph | CurviregError:
         try:
             box = given[i]
-            item = image_item(images[i], box, cameras[i], priors[i], masks[i])
+            item = as_photograph(images[i], box, cameras[i], priors[i], masks[i])
             if (side := _visible_side(item.box, item.size)) < MIN_BOX_SIDE:
                 if box is not None and float(box.abs().max()) <= MAX_FRACTION:
                     raise InvalidInputError(FRACTIONS, kind="fractions")
@@ -224,7 +224,7 @@ def is_missing(box: BoxLike | None) -> bool:
     return box is None or bool(as_numbers(box, "boxes").isnan().all())
 
 
-def rig_cameras(poses: ArrayLike, items: "Sequence[ImageItem | CurviregError]") -> Tensor:
+def rig_cameras(poses: ArrayLike, items: "Sequence[Photograph | CurviregError]") -> Tensor:
     """Poses of the cameras of photographs from the world as (V, 4, 4) float64; an error names the
     photograph: a pose that is not rigid and finite, or that of another photograph by the same
     camera which shows something else."""
@@ -240,8 +240,8 @@ def rig_cameras(poses: ArrayLike, items: "Sequence[ImageItem | CurviregError]") 
             one = items[j]
             other = items[i]
             if (
-                isinstance(one, ImageItem)
-                and isinstance(other, ImageItem)
+                isinstance(one, Photograph)
+                and isinstance(other, Photograph)
                 and _contradict(one, other)
             ):
                 raise InvalidInputError(
@@ -252,7 +252,7 @@ def rig_cameras(poses: ArrayLike, items: "Sequence[ImageItem | CurviregError]") 
     return T
 
 
-def copies_of(T: Tensor, items: "Sequence[ImageItem | CurviregError]") -> dict[int, int]:
+def copies_of(T: Tensor, items: "Sequence[Photograph | CurviregError]") -> dict[int, int]:
     """Photographs of a rig that show what an earlier one does, by their index, and that one: those
     that the same camera took from the same place ``T`` (V, 4, 4). They are no further evidence."""
     found: dict[int, int] = {}
@@ -268,13 +268,14 @@ def copies_of(T: Tensor, items: "Sequence[ImageItem | CurviregError]") -> dict[i
     return found
 
 
-def _by_same_camera(one: ImageItem | CurviregError, other: ImageItem | CurviregError) -> bool:
-    if not (isinstance(one, ImageItem) and isinstance(other, ImageItem)) or one.size != other.size:
+def _by_same_camera(one: Photograph | CurviregError, other: Photograph | CurviregError) -> bool:
+    if isinstance(one, CurviregError) or isinstance(other, CurviregError):
         return False
-    return bool((one.K - other.K).abs().max() <= SAME_PLACE * one.K.abs().max())
+    near = SAME_PLACE * one.K.abs().max()
+    return one.size == other.size and bool((one.K - other.K).abs().max() <= near)
 
 
-def _contradict(one: ImageItem, other: ImageItem) -> bool:
+def _contradict(one: Photograph, other: Photograph) -> bool:
     """Whether small copies of two photographs by the same camera are hardly correlated."""
     if one.size != other.size or not torch.equal(one.K, other.K):
         return False
@@ -300,13 +301,13 @@ def _cameras(given: Any, count: int) -> Sequence[Tensor | Camera | None]:
     ]
 
 
-def image_item(
+def as_photograph(
     image: ImageLike,
     box: Tensor | None,
     camera: Tensor | Camera | None = None,
     prior: PosePrior | None = None,
     mask: MaskLike | None = None,
-) -> ImageItem:
+) -> Photograph:
     """One photograph in any form, with its (4,) box (None: that of the mask, or the whole image),
     however small."""
     (pixels, recorded), notes = _pixels(image), []
@@ -345,7 +346,7 @@ def image_item(
     if camera is not None:
         check_camera_matrix(camera)
         check_square_pixels(camera)
-    item = ImageItem(pixels, box, camera, prior, mask)
+    item = Photograph(pixels, box, camera, prior, mask)
     # Of an object that the border cuts, only the visible part is known.
     item = replace(item, box=clipped(box, item.size))
     if (share := float(_inside(missing, box).float().mean())) > MISSING_SHARE:
@@ -385,10 +386,10 @@ def _inside(pixels: Tensor, box: Tensor) -> Tensor:
     return pixels[y0:y1, x0:x1]
 
 
-class OnDemand(Sequence[ImageItem | CurviregError]):
+class OnDemand(Sequence[Photograph | CurviregError]):
     """``item(0)`` to ``item(count - 1)``, computed at each access, one at a time."""
 
-    def __init__(self, item: Callable[[int], ImageItem | CurviregError], count: int) -> None:
+    def __init__(self, item: Callable[[int], Photograph | CurviregError], count: int) -> None:
         self._item = item
         self._indices = range(count)
 

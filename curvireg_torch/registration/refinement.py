@@ -24,9 +24,9 @@ from .hypotheses import (
     fit_texture_of,
     hypothesis_of,
 )
-from .photograph import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_items
+from .photograph import MIN_BOX_SIDE, Photograph, as_photographs, check_cameras, check_crop
 from .result import FailedRegistration, Registration
-from .stages import map_items, register
+from .stages import map_photographs, register
 from .target import Target, nearest_view
 
 FACTORS = {
@@ -139,19 +139,19 @@ def refine(
         (True, 1)
     """
     check_cameras(images, camera_matrices, "refine")
-    items = image_items(images, None, camera_matrices)
-    return refine_items(target, items, poses, start_confidences=start_confidences)
+    items = as_photographs(images, None, camera_matrices)
+    return refine_prepared(target, items, poses, start_confidences=start_confidences)
 
 
 @torch.no_grad()
-def refine_items(
+def refine_prepared(
     target: Target,
-    items: Sequence[ImageItem | CurviregError],
+    items: Sequence[Photograph | CurviregError],
     poses: ArrayLike,
     *,
     start_confidences: Sequence[float | None] | None = None,
 ) -> list[Registration | FailedRegistration]:
-    """:func:`refine` in photographs that :func:`.image_items` has prepared without boxes."""
+    """:func:`refine` in photographs that :func:`.as_photographs` has prepared without boxes."""
     starts = []
     for one in poses:
         T = as_numbers(one, "poses", dtype=torch.float64).cpu()
@@ -163,11 +163,13 @@ def refine_items(
         raise InvalidInputError(
             f"refine: expected starts of {len(items)} photographs, got {len(starts)}"
         )
-    return map_items(items, lambda item, i: refine_item(target, item, starts[i], limit=limits[i]))
+    return map_photographs(
+        items, lambda item, i: refine_one(target, item, starts[i], limit=limits[i])
+    )
 
 
-def refine_item(
-    target: Target, item: ImageItem, T: Tensor, *, limit: float | None = None
+def refine_one(
+    target: Target, item: Photograph, T: Tensor, *, limit: float | None = None
 ) -> Registration:
     """Refine (S, 4, 4) starts in one photograph, see :func:`refine`; the confidence is at most
     ``limit``. Raises :class:`LostObjectError` where the object is not near any start."""
@@ -252,7 +254,7 @@ def refine_item(
     )
 
 
-def _registered_probability(target: Target, item: ImageItem, pose: Hypotheses) -> float:
+def _registered_probability(target: Target, item: Photograph, pose: Hypotheses) -> float:
     """Probability of one pose, that of the hypotheses within 30 degrees of it, in a registration of
     the box that it projects to, which its rotation does not influence."""
     boxes, _ = boxes_at(target.describer.hull, pose.T, pose.cameras, item.size)

@@ -20,13 +20,13 @@ from ..utils.choices import MESH_KINDS
 from ..utils.executors import Workers
 from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike, MeshLike
 from ..utils.precision import in_full_precision
-from .detection import detect_item
+from .detection import detect_one
 from .judging import best_of_meshes
-from .photograph import ImageItem, image_items
+from .photograph import Photograph, as_photographs
 from .refinement import refine
 from .result import FailedRegistration, Registration
 from .several import register_views
-from .stages import map_items, register_photographs
+from .stages import map_photographs, register_photographs
 from .target import Target
 
 __all__ = ["Registrar"]
@@ -40,7 +40,7 @@ class _Task(NamedTuple):
     """A photograph, by its number in the call."""
 
     number: int
-    item: ImageItem | CurviregError
+    item: Photograph | CurviregError
     detects: bool
 
 
@@ -209,15 +209,15 @@ class Registrar(Target):
         Raises:
             InvalidInputError: not as many boxes, cameras, priors or masks as images.
         """
-        items = image_items(images, boxes, camera_matrices, prior, masks)
-        return self.register_items(items, detects=boxes is None and masks is None)
+        items = as_photographs(images, boxes, camera_matrices, prior, masks)
+        return self.register_prepared(items, detects=boxes is None and masks is None)
 
     @torch.no_grad()
     @in_full_precision
-    def register_items(
-        self, items: Sequence[ImageItem | CurviregError], *, detects: bool = False
+    def register_prepared(
+        self, items: Sequence[Photograph | CurviregError], *, detects: bool = False
     ) -> Results:
-        """Register photographs that :func:`.image_items` has prepared, each to the best of
+        """Register photographs that :func:`.as_photographs` has prepared, each to the best of
         the meshes; ``detects`` searches for the object in the whole photographs.
 
         :meta private:
@@ -229,18 +229,18 @@ class Registrar(Target):
 
         meshes = (self, *self.others)
 
-        def detected(item: ImageItem, index: int) -> Registration | FailedRegistration:
+        def detected(item: Photograph, index: int) -> Registration | FailedRegistration:
             found = [mesh._detected(item, index) for mesh in meshes]
             return best_of_meshes(found, meshes, item)
 
-        found: Results = map_items(items, detected)
+        found: Results = map_photographs(items, detected)
         return found
 
-    def _detected(self, item: ImageItem, index: int) -> Registration | FailedRegistration:
+    def _detected(self, item: Photograph, index: int) -> Registration | FailedRegistration:
         """The registration of a photograph without a box to this mesh alone, or why there is
         none."""
         try:
-            return detect_item(self, item, index)[0]
+            return detect_one(self, item, index)[0]
         except CurviregError as error:
             return FailedRegistration(error.with_subject("").of_image(index))
 
@@ -282,11 +282,11 @@ class Registrar(Target):
 def register_by_workers(
     registrar: Registrar,
     workers: Workers,
-    items: Sequence[ImageItem | CurviregError],
+    items: Sequence[Photograph | CurviregError],
     *,
     detects: bool,
 ) -> Results:
-    """:meth:`.Registrar.register_items` by workers, which get a copy of the registrar each; a
+    """:meth:`.Registrar.register_prepared` by workers, which get a copy of the registrar each; a
     photograph that ends them fails."""
     tasks = [_Task(number, item, detects) for number, item in enumerate(items)]
     size = max(1, min(MAX_BLOCK, len(tasks) // (2 * workers.count)))
@@ -303,10 +303,10 @@ def register_by_workers(
 def _register_block(registrar: Registrar, tasks: Sequence[_Task]) -> Results:
     """The results of a block, whose errors name the number of the photograph in the call."""
     items = [task.item for task in tasks]
-    results = registrar.register_items(items, detects=tasks[0].detects)
+    results = registrar.register_prepared(items, detects=tasks[0].detects)
     return [
         FailedRegistration(result.error.of_image(task.number))
-        if isinstance(result, FailedRegistration) and isinstance(task.item, ImageItem)
+        if isinstance(result, FailedRegistration) and isinstance(task.item, Photograph)
         else result
         for task, result in zip(tasks, results, strict=True)
     ]

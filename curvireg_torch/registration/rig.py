@@ -28,7 +28,7 @@ from ..terms import crop_photographs
 from .block import Described, evidence_of
 from .confidence import MAX_MARGIN, refinement_confidence
 from .hypotheses import Hypotheses
-from .photograph import ImageItem
+from .photograph import Photograph
 from .result import Hypothesis, Registration
 from .target import Target, nearest_view
 
@@ -116,23 +116,19 @@ class RigPhotograph(Described):
     Attributes:
         index: of it among those that were given.
         camera: (4, 4) from the world.
-        K: (3, 3).
-        size: (H, W).
-        box: (4,) in which poses are compared.
+        photograph: with the box in which poses are compared.
         result: the registration of it alone.
     """
 
     crops: EdgeCrops
     index: int
     camera: Tensor
-    K: Tensor
-    size: tuple[int, int]
-    box: Tensor
+    photograph: Photograph
     result: Registration
 
     @staticmethod
     def of(
-        target: Target, item: ImageItem, result: Registration, index: int, camera: Tensor
+        target: Target, item: Photograph, result: Registration, index: int, camera: Tensor
     ) -> "RigPhotograph":
         box = item.box.double() if result.corrected_box is None else result.corrected_box
         settings = target.bank.settings
@@ -147,9 +143,7 @@ class RigPhotograph(Described):
         return RigPhotograph(
             index=index,
             camera=camera,
-            K=item.K,
-            size=item.size,
-            box=box,
+            photograph=replace(item, box=box),
             crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
             query=query,
             rankings=[result.ranking],
@@ -169,8 +163,9 @@ class RigPhotograph(Described):
 
     def sees(self, hull: Tensor, T: Tensor) -> Tensor:
         """(N,) bool: whether world poses (N, 4, 4) lie near the box."""
-        boxes, visible = boxes_at(hull, self.camera @ T, self.K, self.size)
-        return visible & (box_iou(boxes, self.box[None].to(boxes))[:, 0] >= MIN_OVERLAP)
+        seen = self.photograph
+        boxes, visible = boxes_at(hull, self.camera @ T, seen.K, seen.size)
+        return visible & (box_iou(boxes, seen.box[None].to(boxes))[:, 0] >= MIN_OVERLAP)
 
 
 # Photographs of a rig by their index, or why they failed
@@ -323,7 +318,7 @@ class Rig:
     def problems(self) -> list[ContourProblem]:
         """A pose in each photograph: at full size, half of it, and a quarter."""
         crops = EdgeCrops.cat([p.crops for p in self.photographs])
-        K = torch.stack([p.K for p in self.photographs])
+        K = torch.stack([p.photograph.K for p in self.photographs])
         index = torch.arange(len(self.photographs))
         return [
             ContourProblem.of(self.describer.contours, crops, K, index, factor=factor)
@@ -451,7 +446,7 @@ class Rig:
         ranks = self.ranks(T)
         for v, photograph in enumerate(self.photographs):
             R, distance = self.allocentric(photograph, T)
-            cameras = photograph.K.expand(len(T), 3, 3)
+            cameras = photograph.photograph.K.expand(len(T), 3, 3)
             view = torch.zeros(len(T), dtype=torch.long)
             poses = replace(
                 Hypotheses.at(
@@ -468,7 +463,7 @@ class Rig:
     def details(self, photograph: RigPhotograph, T: Tensor) -> Tensor:
         """(M,) how much the details of world poses (M, 4, 4) are better than those of the first in
         a photograph."""
-        K = photograph.K.expand(len(T), 3, 3)
+        K = photograph.photograph.K.expand(len(T), 3, 3)
         index = torch.zeros(len(T), dtype=torch.long)
         scores, _ = compare_details(
             self.describer.contours, photograph.crops, K, photograph.camera @ T, index
@@ -511,7 +506,7 @@ class Rig:
             evidence=evidence,
             allocentric_rotation=R,
             distance=float(distance),
-            projection=(first.camera @ T, first.K),
+            projection=(first.camera @ T, first.photograph.K),
             view=nearest_view(self.target, R),
             edge_support=evidence["edge_support"],
             covariance=C.clone() if bool(C.isfinite().all()) else None,

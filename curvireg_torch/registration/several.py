@@ -21,7 +21,14 @@ from .confidence import (
     undetermined_axes,
 )
 from .detection import detect
-from .photograph import ImageItem, check_cameras, copies_of, image_items, is_missing, rig_cameras
+from .photograph import (
+    Photograph,
+    as_photographs,
+    check_cameras,
+    copies_of,
+    is_missing,
+    rig_cameras,
+)
 from .result import FailedRegistration, PhotographPose, Registration
 from .rig import ELSEWHERE, Answer, Found, Rig, RigPhotograph
 from .stages import register_photographs
@@ -81,7 +88,7 @@ def register_views(
     check_cameras(images, camera_matrices, "register_views")
     count = target.pipeline.hypotheses
     target = target.with_hypotheses(JOINT_HYPOTHESES)
-    items = image_items(images, boxes, camera_matrices)
+    items = as_photographs(images, boxes, camera_matrices)
     cameras = rig_cameras(T_cam_from_world, items)
     copies = copies_of(cameras, items)
     given = (
@@ -99,7 +106,7 @@ def register_views(
             item = items[i]
             if isinstance(result, FailedRegistration):
                 found[i] = result.error
-            elif isinstance(item, ImageItem) and result.detection is not None:
+            elif isinstance(item, Photograph) and result.detection is not None:
                 item = replace(item, box=result.detection.box.float())
                 found[i] = RigPhotograph.of(target, item, result, i, cameras[i])
         # they tell where it is in the others
@@ -116,7 +123,7 @@ def register_views(
 
 def _registered(
     target: Target,
-    items: Sequence[ImageItem | CurviregError],
+    items: Sequence[Photograph | CurviregError],
     cameras: Tensor,
     chosen: Sequence[int],
     T: Tensor | None = None,
@@ -138,8 +145,8 @@ def _registered(
 
 
 def _placed(
-    target: Target, item: ImageItem | CurviregError, camera: Tensor, T: Tensor | None
-) -> ImageItem | CurviregError:
+    target: Target, item: Photograph | CurviregError, camera: Tensor, T: Tensor | None
+) -> Photograph | CurviregError:
     """A photograph with its box, or with that around a world pose ``T`` (1, 4, 4)."""
     if T is None or isinstance(item, CurviregError):
         return item
@@ -196,7 +203,9 @@ def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> 
         if isinstance(one := found[i], RigPhotograph):
             similarity = compared[i]["similarity"]
             support = compared[i]["edge_support"]
-            view = replace(view, box=one.box, similarity=similarity, edge_support=support)
+            view = replace(
+                view, box=one.photograph.box, similarity=similarity, edge_support=support
+            )
         views.append(view)
     return Registration(
         hypotheses=tuple(rig.hypothesis(answer, m, mean) for m in range(min(count, len(total)))),
@@ -228,10 +237,12 @@ def _joint_features(
         features["ranking_share"] for features in measured if features["ranking_share"] is not None
     ]
     outside = [
-        outside_fraction(rig.describer.hull, p.camera @ answer.T[0], p.K, p.size)
+        outside_fraction(
+            rig.describer.hull, p.camera @ answer.T[0], p.photograph.K, p.photograph.size
+        )
         for p in rig.photographs
     ]
-    border = [float(border_sides(p.box, p.size)) for p in rig.photographs]
+    border = [float(border_sides(p.photograph.box, p.photograph.size)) for p in rig.photographs]
     weights = weights / weights.sum()
     return confidence_features(
         mean,

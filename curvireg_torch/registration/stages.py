@@ -47,7 +47,7 @@ from .hypotheses import (
     with_short_fit,
 )
 from .judging import best_of_meshes, compared_with_mirror_image, judged, with_siblings
-from .photograph import ImageItem, check_crop
+from .photograph import Photograph, check_crop
 from .result import FailedRegistration, Registration
 from .target import Target
 
@@ -61,7 +61,7 @@ BLOCK_OF_DEVICE = 64
 
 def register_photographs(
     target: Target,
-    items: Sequence[ImageItem | CurviregError],
+    items: Sequence[Photograph | CurviregError],
     others: Sequence[Target] = (),
 ) -> list[Registration | FailedRegistration]:
     """Register photographs with boxes, in blocks, each to the best of the target and ``others``;
@@ -75,13 +75,13 @@ def register_photographs(
             some = [items[k] for k in range(first, min(first + size, len(items)))]
             of_meshes = [_register_block(mesh, some, first) for mesh in meshes]
             for item, found in zip(some, zip(*of_meshes, strict=True), strict=True):
-                given = item if isinstance(item, ImageItem) else None
+                given = item if isinstance(item, Photograph) else None
                 results.append(best_of_meshes(found, meshes, given))
     return results
 
 
 def _register_block(
-    target: Target, items: Sequence[ImageItem | CurviregError], first: int
+    target: Target, items: Sequence[Photograph | CurviregError], first: int
 ) -> list[Registration | FailedRegistration]:
     """Register a few photographs; the ``first`` one's index is that of the caller."""
     results: list[Registration | FailedRegistration] = []
@@ -96,8 +96,8 @@ def _register_block(
     return results
 
 
-def map_items(
-    items: Sequence[ImageItem | CurviregError], function: Callable[[ImageItem, int], Any]
+def map_photographs(
+    items: Sequence[Photograph | CurviregError], function: Callable[[Photograph, int], Any]
 ) -> list[Any]:
     """Results of ``function(item, index)`` for photographs one by one, a
     :class:`FailedRegistration` for each error. Items are read on demand, so that few are in
@@ -121,14 +121,14 @@ def _failure(error: CurviregError, index: int) -> FailedRegistration:
 
 
 def _with_corrected_boxes(
-    target: Target, items: Sequence[ImageItem | CurviregError], results: Sequence[Result]
+    target: Target, items: Sequence[Photograph | CurviregError], results: Sequence[Result]
 ) -> list[Result]:
     """Results, with those of another box where the pose asks for one in which it is seen better."""
     found = list(results)
-    changed: dict[int, ImageItem] = {}
+    changed: dict[int, Photograph] = {}
     boxes: dict[int, Tensor] = {}
     for index, (item, result) in enumerate(zip(items, results, strict=True)):
-        if isinstance(item, ImageItem) and isinstance(result, Registration):
+        if isinstance(item, Photograph) and isinstance(result, Registration):
             box = _other_box(target, item, result)
             if box is not None:
                 boxes[index] = box
@@ -145,7 +145,7 @@ def _with_corrected_boxes(
     return found
 
 
-def _other_box(target: Target, item: ImageItem, result: Registration) -> Tensor | None:
+def _other_box(target: Target, item: Photograph, result: Registration) -> Tensor | None:
     """The box of the pose that was found, if the photograph shows another part in it."""
     # Without a camera, poses are derived from their boxes.
     if not (target.pipeline.box_jitter and target.pipeline.contours and result.camera is not None):
@@ -156,7 +156,7 @@ def _other_box(target: Target, item: ImageItem, result: Registration) -> Tensor 
     return box if alike and item.shows_other_part(box) else None
 
 
-def register_boxes(target: Target, items: Sequence[ImageItem | CurviregError]) -> list[Result]:
+def register_boxes(target: Target, items: Sequence[Photograph | CurviregError]) -> list[Result]:
     """Register photographs in their boxes. Those with a mask and those without are blocks of their
     own: a mask weights the edges of all."""
     found: dict[int, Result] = {
@@ -166,14 +166,14 @@ def register_boxes(target: Target, items: Sequence[ImageItem | CurviregError]) -
         alike = {
             k: item
             for k, item in enumerate(items)
-            if isinstance(item, ImageItem) and (item.mask is not None) == has_mask
+            if isinstance(item, Photograph) and (item.mask is not None) == has_mask
         }
         together = _register_alike(target, list(alike.values()))
         found.update(zip(alike, together, strict=True))
     return [found[k] for k in range(len(items))]
 
 
-def _register_alike(target: Target, items: Sequence[ImageItem]) -> list[Result]:
+def _register_alike(target: Target, items: Sequence[Photograph]) -> list[Result]:
     """Register photographs together; where that fails, each alone, so that an error is that of its
     own photograph."""
     if not items:
@@ -185,14 +185,14 @@ def _register_alike(target: Target, items: Sequence[ImageItem]) -> list[Result]:
         if len(items) == 1:
             return [error]
     shown = [_shown(target, item) for item in items]
-    usable = [item for item in shown if isinstance(item, ImageItem)]
+    usable = [item for item in shown if isinstance(item, Photograph)]
     if len(usable) == len(items):
         return [_register_alike(target, [item])[0] for item in items]
     registered = iter(_register_alike(target, usable))
-    return [next(registered) if isinstance(one, ImageItem) else one for one in shown]
+    return [next(registered) if isinstance(one, Photograph) else one for one in shown]
 
 
-def _shown(target: Target, item: ImageItem) -> ImageItem | CurviregError:
+def _shown(target: Target, item: Photograph) -> Photograph | CurviregError:
     """A photograph whose box can be described, or why it cannot."""
     try:
         describe(target, [item])
@@ -203,7 +203,7 @@ def _shown(target: Target, item: ImageItem) -> ImageItem | CurviregError:
 
 @torch.no_grad()
 def register(
-    target: Target, photographs: Sequence[ImageItem], query: QueryFeatures
+    target: Target, photographs: Sequence[Photograph], query: QueryFeatures
 ) -> list[Registration]:
     """Register photographs: rank, start, screen, fit, refit, judge.
 
@@ -246,7 +246,7 @@ def register(
     return with_checked_cameras(target, block, block.crops, best, results)
 
 
-def describe(target: Target, items: Sequence[ImageItem]) -> QueryFeatures:
+def describe(target: Target, items: Sequence[Photograph]) -> QueryFeatures:
     """Crop and describe the boxes of photographs; one that shows nothing is refused."""
     boxes = torch.stack([item.box for item in items])
     query = target.matcher.query([item.image for item in items], boxes)
@@ -255,7 +255,7 @@ def describe(target: Target, items: Sequence[ImageItem]) -> QueryFeatures:
     return query
 
 
-def rank(target: Target, photographs: Sequence[ImageItem], query: QueryFeatures) -> Block:
+def rank(target: Target, photographs: Sequence[Photograph], query: QueryFeatures) -> Block:
     """Compare the views of the bank with photographs."""
     for _ in photographs:
         target.report_progress("ranking")

@@ -22,7 +22,7 @@ from ..mesh.mesh import mirrored
 from ..mesh.round_axis import RoundAxis, round_axis
 from ..mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from ..terms import QueryFeatures
-from .photograph import ImageItem
+from .photograph import Photograph
 
 # Symmetries that are compared, the identity among them: every 30 degrees of a body of revolution
 MAX_SIBLINGS = 12
@@ -179,7 +179,7 @@ class Target:
         return self.is_exact and self.pipeline.contours
 
     def keypoint_matches(
-        self, item: ImageItem, box: Tensor | None = None
+        self, item: Photograph, box: Tensor | None = None
     ) -> KeypointMatches | None:
         """Keypoints of the mesh's print in a photograph, or in a ``box`` (4,) of it; None without
         colours or a camera matrix.
@@ -235,7 +235,7 @@ class Target:
         """Proposes boxes where none are given."""
         return Detector(self.matcher)
 
-    def object_mask(self, query: QueryFeatures, items: Sequence[ImageItem]) -> Tensor | None:
+    def object_mask(self, query: QueryFeatures, items: Sequence[Photograph]) -> Tensor | None:
         """(B, 1, S, S) probability that pixels of the crops belong to the object: given, predicted,
         or None."""
         settings = self.bank.settings

@@ -40,8 +40,8 @@ from ..utils.likes import ArrayLike, BoxLike, ImageLike
 from ..utils.threads import map_on_threads
 from .confidence import RELIABLE, tracking_confidence
 from .hypotheses import Hypotheses, hypothesis_of
-from .photograph import ImageItem, image_items
-from .refinement import OUTSIDE, refine_item
+from .photograph import Photograph, as_photographs
+from .refinement import OUTSIDE, refine_one
 from .registrar import Registrar
 from .result import FailedRegistration, Registration
 from .target import nearest_view
@@ -412,12 +412,12 @@ class Follower:
         check_tensor(T, "pose", (4, 4))
         check_pose(T, "pose")
         confidence = check_probability(confidence, "confidence")
-        item = image_items([image], None, self.camera_matrix)[0]
-        if not isinstance(item, ImageItem):
+        item = as_photographs([image], None, self.camera_matrix)[0]
+        if not isinstance(item, Photograph):
             raise item
         map_on_threads(lambda item: self._start(item, T, confidence), [item])
 
-    def _start(self, item: ImageItem, T: Tensor, confidence: float) -> None:
+    def _start(self, item: Photograph, T: Tensor, confidence: float) -> None:
         self._tracker.start(item.image, item.K, T)
         self._base = confidence
 
@@ -437,8 +437,8 @@ class Follower:
         return map_on_threads(lambda image: self._next(image, box), [image])[0]
 
     def _next(self, image: ImageLike, box: BoxLike | None) -> Registration | FailedRegistration:
-        item = image_items([image], None, self.camera_matrix)[0]
-        if not isinstance(item, ImageItem):
+        item = as_photographs([image], None, self.camera_matrix)[0]
+        if not isinstance(item, Photograph):
             return FailedRegistration(item)
         if self._base is None:
             return self._registered(item, image, box, BELIEVED_CONFIDENCE)
@@ -475,7 +475,7 @@ class Follower:
         )
 
     def _registered(
-        self, item: ImageItem, image: ImageLike, box: BoxLike | None, least: float
+        self, item: Photograph, image: ImageLike, box: BoxLike | None, least: float
     ) -> Registration | FailedRegistration:
         """Register a frame; track from its pose if it lies within the frame, with a confidence of
         ``least``."""
@@ -509,17 +509,17 @@ class Follower:
         self._agreeing.append(pose)
         return len(self._agreeing) >= AGREEING_FRAMES
 
-    def _refined(self, item: ImageItem, starts: Tensor) -> Registration | FailedRegistration:
+    def _refined(self, item: Photograph, starts: Tensor) -> Registration | FailedRegistration:
         """Refined poses; a registration that is not reliable does not raise the confidence."""
         try:
-            result = refine_item(self.registrar, item, starts)
+            result = refine_one(self.registrar, item, starts)
         except CurviregError as error:
             return FailedRegistration(error)
         assert self._base is not None
         bound = 1.0 if _confidence(result) >= self._reliable else self._base
         return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
 
-    def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
+    def _registration(self, tracked: TrackedPose, item: Photograph) -> Registration:
         """The result of a tracked pose, without ranking and without rivals."""
         describer = self.registrar.describer
         T = tracked.state.T.clone()  # a tensor like any other, not one of inference mode

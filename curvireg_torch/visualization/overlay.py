@@ -15,7 +15,7 @@ from ..matching import ViewDescriber
 from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.confidence import two_decimals
-from ..registration.photograph import ImageItem, image_item
+from ..registration.photograph import Photograph, as_photograph
 from ..terms import crop_photographs, photograph_field
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, ImageLike
@@ -73,7 +73,7 @@ def contour_overlay(
         >>> contour_overlay(registrar, result, scene.image, scene.box).shape
         (720, 960, 3)
     """
-    item = image_item(image, as_numbers(box, "box"))
+    item = as_photograph(image, as_numbers(box, "box"))
     H, W = item.size
     describer = registrar.of_mesh(getattr(result, "mesh_index", 0)).describer
     more = drawn_copies(registrar, copies)
@@ -168,7 +168,7 @@ def side_pictures(
         >>> sorted(side_pictures(registrar, result, scene.image, scene.box))
         ['photograph', 'photograph field', 'pose', 'view field']
     """
-    item = image_item(image, as_numbers(box, "box"))
+    item = as_photograph(image, as_numbers(box, "box"))
     settings = registrar.bank.settings
     crop = crop_photographs(
         [item.image], item.box[None], size=settings.image_size, margin=settings.margin
@@ -219,7 +219,7 @@ def registration_sheet(
         >>> registration_sheet(registrar, result, scene.image, scene.box).shape[1]
         960
     """
-    item = image_item(image, as_numbers(box, "box"))
+    item = as_photograph(image, as_numbers(box, "box"))
     more = drawn_copies(registrar, copies)
     axis = axis_ends(registrar, result)
     if axis is not None:
@@ -296,7 +296,7 @@ def _draw_caption(
 
 
 def _small_pictures(
-    registrar: Registrar, result: Registration, item: ImageItem, side: int
+    registrar: Registrar, result: Registration, item: Photograph, side: int
 ) -> list[tuple[str, np.ndarray]]:
     """Captions and pictures, at most ``side`` px wide and high."""
     window = close_up(item.size, item.box.tolist())

@@ -38,13 +38,13 @@ def register_list(folder, register):
 
 def test_instances_are_those_of_each_row_without_a_box(register_list, monkeypatch):
     asked = []
-    detect = photograph.detect_items
+    detect = photograph.detect_prepared
 
     def watched(*arguments, instances, **options):
         asked.append(instances)
         return detect(*arguments, instances=instances, **options)
 
-    monkeypatch.setattr(photograph, "detect_items", watched)
+    monkeypatch.setattr(photograph, "detect_prepared", watched)
     assert (
         register_list("all.csv", HEADER, ["photos/2.png", *EMPTY], words=["--instances", "2"]) == 0
     )

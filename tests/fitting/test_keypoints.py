@@ -21,7 +21,7 @@ from curvireg_torch.registration import block, stages
 from curvireg_torch.registration.confidence import KEYPOINT_PROBABILITY, detection_probability
 from curvireg_torch.registration.detection import detect, propose
 from curvireg_torch.registration.hypotheses import fit_poses, placed
-from curvireg_torch.registration.photograph import image_items
+from curvireg_torch.registration.photograph import as_photographs
 from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background
 
@@ -257,7 +257,7 @@ def test_a_pose_outside_the_limits_is_no_start():
 
 def test_meshes_without_colours_and_photographs_without_a_camera_have_no_keypoints():
     T = pose(65.0, 0.4, 4.0)
-    item = image_items([photograph(T)], box_of(T)[None], K)[0]
+    item = as_photographs([photograph(T)], box_of(T)[None], K)[0]
     grey = cr.Registrar(
         trimesh.creation.box(), views=cr.sample_views(azimuth_step=180, elevations=[0])
     )
@@ -269,7 +269,7 @@ def test_meshes_without_colours_and_photographs_without_a_camera_have_no_keypoin
 
 def test_boxes_of_keypoints_are_the_first_proposals_less_certain_with_a_rival():
     T = pose(65.0, 0.4, 4.0)
-    item = image_items([photograph(T)], None, K)[0]
+    item = as_photographs([photograph(T)], None, K)[0]
     proposals = propose(registrar(), item)
     assert float(box_iou(proposals.boxes[:1], box_of(T)[None])) > 0.9
     counts = [found.count for found in keypoints().matches(item.image, K).poses()]

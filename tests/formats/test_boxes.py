@@ -14,7 +14,7 @@ from curvireg_torch.errors import CurviregWarning, InvalidInputError, MissingFil
 from curvireg_torch.formats.boxes import BoxFile, PictureSize, pixel_box, read_boxes
 from curvireg_torch.formats.pictures import oriented, picture_size
 from curvireg_torch.jobs.options import with_advice
-from curvireg_torch.registration.photograph import image_items
+from curvireg_torch.registration.photograph import as_photographs
 from tests._support.exif import exif, with_exif
 from tests._support.real_data import real_case
 
@@ -403,6 +403,6 @@ def test_messages_name_the_format_that_is_suspected():
         ([40.0, 30.0, 20.0, 15.0], "corners, not width and height, or --box-format xywh"),
         ([5.0, 5.0, 10.0, 40.0], "the part of the photograph in the box has 5.0 px"),
     ):
-        (found,) = image_items(pictures, [box], None)
+        (found,) = as_photographs(pictures, [box], None)
         assert words in with_advice(found)
         assert "--" not in str(found)

@@ -12,7 +12,7 @@ from curvireg_torch.data.images import read_photo
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.formats.masks import mask_as_shown, mask_file, read_mask
 from curvireg_torch.formats.pictures import picture_size
-from curvireg_torch.registration.photograph import image_item
+from curvireg_torch.registration.photograph import as_photograph
 from tests._support.exif import exif, with_exif
 
 OBJECT = np.zeros((20, 30), bool)
@@ -32,7 +32,7 @@ def test_one_value_beside_zero_is_the_object(tmp_path, white, dtype):
     found = read_mask(file)
     assert np.array_equal(found >= 0.5, OBJECT)
     assert found.dtype == np.float32
-    item = image_item(torch.rand(3, 20, 30), None, mask=file)
+    item = as_photograph(torch.rand(3, 20, 30), None, mask=file)
     assert item.box.tolist() == [5.5, 3.5, 23.5, 13.5]
 
 
@@ -95,10 +95,10 @@ def test_masks_are_turned_as_their_photographs(tmp_path, suffix):
 
 
 def test_arrays_of_labels_are_read_as_files_are():
-    item = image_item(torch.rand(3, 20, 30), None, mask=2 * OBJECT.astype(np.uint8))
+    item = as_photograph(torch.rand(3, 20, 30), None, mask=2 * OBJECT.astype(np.uint8))
     assert torch.equal(item.mask, torch.from_numpy(OBJECT).float())
     with pytest.raises(InvalidInputError, match=r"labels 2, 5; .* mask == LABEL"):
-        image_item(
+        as_photograph(
             torch.rand(3, 20, 30), None, mask=torch.from_numpy(2 + 3 * OBJECT.astype(np.uint8))
         )
 
@@ -133,7 +133,7 @@ def test_masks_of_the_pixels_in_the_file_are_turned_with_the_photograph(
     mask = written(tmp_path / "mask.png", 255 * given.astype(np.uint8))
     forms = {"path": mask, "array": given, "tensor": torch.from_numpy(np.array(given))}
     for shown in (forms[form], as_shown):
-        item = image_item(
+        item = as_photograph(
             photo.image, None, mask=mask_as_shown(shown, picture_size(tmp_path / "photo.png"))
         )
         assert np.array_equal(item.mask.numpy() >= 0.5, as_shown)

@@ -20,7 +20,7 @@ from curvireg_torch.inspection.look_alikes import (
 from curvireg_torch.inspection.page import report_lines, report_page
 from curvireg_torch.inspection.photographs import (
     SIZE,
-    Photograph,
+    GeneratedPhotograph,
     PhotographGenerator,
     photographed_mesh,
     trial_camera,
@@ -308,7 +308,7 @@ def test_trial_counts_right_and_reliable_and_stages_are_reported_in_order(regist
 
 
 def outcome(error: float, *, elevation: float = 0.0) -> Outcome:
-    photograph = Photograph(
+    photograph = GeneratedPhotograph(
         torch.zeros(3, 4, 4, dtype=torch.uint8),
         torch.tensor([0.0, 0, 200, 100]),
         torch.eye(4, dtype=torch.float64),

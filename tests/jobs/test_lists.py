@@ -275,7 +275,7 @@ def test_every_copy_of_the_object_has_a_row_and_is_drawn(registrar, entry, tmp_p
     image, boxes = two_trucks()
     write_photo(tmp_path / "two.png", image)
     found = found_in(registrar, image, boxes)
-    monkeypatch.setattr(photograph, "detect_items", lambda *_, **__: [found])
+    monkeypatch.setattr(photograph, "detect_prepared", lambda *_, **__: [found])
     cells = {"photo": "two.png", "note": "shelf"}
     shelf = Entry(cells, "two.png", tmp_path / "two.png", entry.meshes, instances=4)
     located = replace(shelf, cells={"photo": "one", "note": ""}, photo=entry.photo, box=entry.box)

@@ -94,10 +94,10 @@ def test_register_takes_the_camera_from_exif(folder):
 
 def test_a_box_that_was_replaced_is_that_of_the_result(folder, monkeypatch):
     fits = torch.tensor([1.0, 2.0, 30.0, 40.0]).double()
-    original = cr.Registrar.register_items
+    original = cr.Registrar.register_prepared
     monkeypatch.setattr(
         cr.Registrar,
-        "register_items",
+        "register_prepared",
         lambda *a, **k: [replace(original(*a, **k)[0], corrected_box=fits)],
     )
     found = cr.register(
@@ -137,7 +137,7 @@ def test_every_copy_is_drawn_and_saved(tmp_path, monkeypatch):
     image, boxes = two_trucks()
     registrar = learned_registrar()
     found = found_in(registrar, image, boxes)
-    monkeypatch.setattr(photograph, "detect_items", lambda *_, **__: [found])
+    monkeypatch.setattr(photograph, "detect_prepared", lambda *_, **__: [found])
     entry = Entry(name="two.png", photo=tmp_path / "two.png", meshes=(), instances=2)
     picture = Photo((255 * image).round().byte(), 1, None, ())
     result = photograph.register_observation(observe(entry, picture), registrar)

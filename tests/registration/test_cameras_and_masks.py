@@ -12,7 +12,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import undistorted
 from curvireg_torch.geometry.cameras import boxes_around
 from curvireg_torch.registration import FailedRegistration, Follower, detect
-from curvireg_torch.registration.photograph import image_item, image_items
+from curvireg_torch.registration.photograph import as_photograph, as_photographs
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_registrar
 
@@ -77,16 +77,17 @@ def test_detection_refinement_and_following_take_cameras():
 
 def test_inverted_masks_and_boxes_that_the_camera_did_not_record_are_warned_of():
     camera = Camera(CAMERA, (1.5, 0.0, 0.0, 0.0), size=SIZE)
-    item = image_item(torch.rand(3, *SIZE), torch.tensor([0.0, 0.0, 60.0, 60.0]), camera)
+    item = as_photograph(torch.rand(3, *SIZE), torch.tensor([0.0, 0.0, 60.0, 60.0]), camera)
     assert not item.warnings
-    item = image_item(torch.rand(3, *SIZE), torch.tensor([-60.0, -60.0, 30.0, 30.0]), camera)
+    item = as_photograph(torch.rand(3, *SIZE), torch.tensor([-60.0, -60.0, 30.0, 30.0]), camera)
     assert "% of the box lie where the distorted photograph shows nothing" in item.warnings[0]
     mask = torch.ones(40, 60)
     mask[5:35, 20:50] = 0.0
     assert (
-        "must be white, not black" in image_item(torch.rand(3, 40, 60), None, mask=mask).warnings[0]
+        "must be white, not black"
+        in as_photograph(torch.rand(3, 40, 60), None, mask=mask).warnings[0]
     )
-    assert not image_item(torch.rand(3, 40, 60), None, mask=1.0 - mask).warnings
+    assert not as_photograph(torch.rand(3, 40, 60), None, mask=1.0 - mask).warnings
 
 
 def test_mask_gives_the_box_and_the_outline():
@@ -98,10 +99,10 @@ def test_mask_gives_the_box_and_the_outline():
         [-0.5, -0.5, 0.5, 0.5]
     )
     torch.testing.assert_close(
-        image_item(photo, None, RADIAL, mask=mask).box, true_box, atol=1.0, rtol=0
+        as_photograph(photo, None, RADIAL, mask=mask).box, true_box, atol=1.0, rtol=0
     )
     assert torch.equal(
-        image_item(photo, box, RADIAL, mask=mask).box, undistorted(photo, RADIAL, box).box
+        as_photograph(photo, box, RADIAL, mask=mask).box, undistorted(photo, RADIAL, box).box
     )
 
 
@@ -115,10 +116,10 @@ def test_mask_decides_which_edges_are_the_outline():
     assert errors(with_mask, T)[1] < errors(without, T)[1]
     assert not torch.equal(wrong.translation, with_mask.translation)
     query = register.matcher.query([image], box[None])
-    crop = register.object_mask(query, [image_item(image, box, CAMERA, mask=mask)])
+    crop = register.object_mask(query, [as_photograph(image, box, CAMERA, mask=mask)])
     assert crop.shape == (1, 1, 96, 96)
     assert 0.3 < float(crop.mean()) < 0.7
-    assert register.object_mask(query, [image_item(image, box, CAMERA)]) is None
+    assert register.object_mask(query, [as_photograph(image, box, CAMERA)]) is None
 
 
 def test_a_given_mask_replaces_the_predicted_one_of_the_box():
@@ -126,7 +127,7 @@ def test_a_given_mask_replaces_the_predicted_one_of_the_box():
     register = learned_registrar()
     query = register.matcher.query([image], box[None])
     none, given = (
-        image_item(image, box, CAMERA, mask=mask)
+        as_photograph(image, box, CAMERA, mask=mask)
         for mask in (None, torch.ones(SIZE, dtype=torch.bool))
     )
     predicted = register.object_mask(query, [none])
@@ -147,7 +148,7 @@ def test_masks_in_any_form_are_read_and_unusable_ones_named(tmp_path):
         mask.numpy().astype(np.float64),
         tmp_path / "mask.png",
     ):
-        item = image_item(torch.rand(3, 40, 60), None, mask=form)
+        item = as_photograph(torch.rand(3, 40, 60), None, mask=form)
         assert torch.equal(item.mask, mask.float())
         assert item.box.tolist() == [19.5, 9.5, 49.5, 29.5]
     for mask, box, words in (
@@ -177,7 +178,7 @@ def test_masks_in_any_form_are_read_and_unusable_ones_named(tmp_path):
 def test_camera_is_scaled_to_each_photograph():
     ideal, photo, box, _, _ = distorted(RADIAL, 1)
     half = torch.nn.functional.avg_pool2d(photo[None], 2)[0]
-    items = image_items(
+    items = as_photographs(
         [photo, half, ideal],
         [box.tolist(), ((box + 0.5) / 2 - 0.5).tolist(), [1, 1, 60, 60]],
         RADIAL,
@@ -188,7 +189,7 @@ def test_camera_is_scaled_to_each_photograph():
     )
     torch.testing.assert_close((large + 0.5) / 2 - 0.5, small)
     torch.testing.assert_close((items[0].box + 0.5) / 2 - 0.5, items[1].box, atol=0.02, rtol=0)
-    (error,) = image_items([photo[:, :90]], None, RADIAL)
+    (error,) = as_photographs([photo[:, :90]], None, RADIAL)
     assert "calibrated for 240 x 180 px, but the photograph has 240 x 90 px" in str(error)
     with pytest.raises(InvalidInputError, match="expected 1, one for each image, got 2"):
-        image_items([photo], None, [RADIAL, OFF_CENTRE])
+        as_photographs([photo], None, [RADIAL, OFF_CENTRE])

@@ -23,7 +23,7 @@ from curvireg_torch.matching.detector import _medoids
 from curvireg_torch.registration import Detector, Proposals, detect
 from curvireg_torch.registration import detection as detection_module
 from curvireg_torch.registration.detection import Candidate, Found, _add, _allowed_views
-from curvireg_torch.registration.photograph import ImageItem
+from curvireg_torch.registration.photograph import Photograph
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from curvireg_torch.visualization.words import corners
 from tests._support.scenes import CAMERA, scene, unrefined
@@ -249,7 +249,7 @@ def test_detector_does_not_compare_views_that_the_prior_excludes(registrar, foun
     monkeypatch.setattr(registrar, "mesh_is", "similar")
     result = registrar([image], prior=prior)[0]
     allowed = _allowed_views(
-        registrar, ImageItem(image, torch.tensor([0.0, 0.0, 9.0, 9.0]), None, prior)
+        registrar, Photograph(image, torch.tensor([0.0, 0.0, 9.0, 9.0]), None, prior)
     )
     assert sorted(
         viewpoint_from_rotation(bank().rotations[allowed])[0].round().unique().tolist()
@@ -266,7 +266,7 @@ def test_allowed_views_are_those_of_any_place_in_the_photograph(registrar):
     """Half of the diagonal is 30 degrees wide; 7.5 more are the spacing of views."""
     image = scene(0)[0]
     prior = PosePrior(rotation=bank().rotations[0], within=1.0)
-    item = ImageItem(image, torch.tensor([-0.5, -0.5, 239.5, 179.5]), CAMERA, prior)
+    item = Photograph(image, torch.tensor([-0.5, -0.5, 239.5, 179.5]), CAMERA, prior)
     degrees = rotation_error(bank().rotations, bank().rotations[0])
     half = math.degrees(math.atan(150 / 260))
     assert torch.equal(_allowed_views(registrar, item), degrees <= 8.5 + half)
@@ -380,7 +380,7 @@ def test_box_around_the_pose_is_registered_where_it_is_more_certain(
     other = as_found(found[2])
     again = SimpleNamespace(score=one.score + gain, register=lambda *_: other)
     monkeypatch.setattr(Candidate, "compared", lambda *_, **__: again)
-    best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), one)
+    best = detection_module._refined(registrar, Photograph(found[0], found[1], None), one)
     assert best is (one if kept else other)
 
 

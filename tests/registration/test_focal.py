@@ -13,7 +13,7 @@ from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error
 from curvireg_torch.geometry.cameras import point_in_cameras, rotation_towards
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.hypotheses import Hypotheses, projected_box
-from curvireg_torch.registration.photograph import image_item
+from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 from tests.fitting.test_focal_length import NEAR, near_scene
@@ -28,7 +28,7 @@ def test_covariance_and_deviation_of_the_focal_length():
         T[None], NEAR[None], describer.centre, one, torch.zeros(1, dtype=torch.float64)
     )
     poses = replace(poses, covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
-    item = replace(image_item(image, box, NEAR), focal_deviation=0.05, camera_source="exif")
+    item = replace(as_photograph(image, box, NEAR), focal_deviation=0.05, camera_source="exif")
     covariance, deviation = camera_module.focal_covariance(describer, crops, poses, item)
     assert 0.0 < deviation < 0.05, "the prior and the photograph together"
     z = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
@@ -121,7 +121,7 @@ def test_fields_of_view_are_across_the_longer_side():
 
 def test_priors_by_source():
     image, box, _ = near_scene()
-    item = image_item(image, box, NEAR)
+    item = as_photograph(image, box, NEAR)
     cameras = focal_length.scaled_cameras(NEAR[None], torch.tensor([0.1]).double())
     exif = camera_module.focal_prior(
         replace(item, focal_deviation=0.05, camera_source="exif"), cameras
@@ -146,7 +146,7 @@ def test_the_deviation_joins_prior_and_photograph():
         T[None], NEAR[None], describer.centre, one, torch.zeros(1, dtype=torch.float64)
     )
     poses = replace(poses, covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
-    item = replace(image_item(image, box, NEAR), camera_source="exif")
+    item = replace(as_photograph(image, box, NEAR), camera_source="exif")
 
     def variance(prior):
         known = replace(item, focal_deviation=prior)

@@ -39,7 +39,7 @@ def test_follower_starts_from_a_known_pose_without_registering(monkeypatch):
     registrar = truck_registrar()
     follow = Follower(registrar, CAMERA)
     follow.start(frames[0][0], frames[0][2])
-    monkeypatch.setattr(tracking, "refine_item", None)  # neither search
+    monkeypatch.setattr(tracking, "refine_one", None)  # neither search
     monkeypatch.setattr(type(registrar), "__call__", None)  # nor registration
     for image, _, T in frames[1:]:
         result = follow(image)
@@ -174,15 +174,15 @@ def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
     follow.start(frames[0][0], frames[0][2])
     with monkeypatch.context() as patch:
         patch.setattr("curvireg_torch.registration.tracking.tracking_confidence", lambda _: 0.3)
-        patch.setattr(tracking, "refine_item", LOST)
+        patch.setattr(tracking, "refine_one", LOST)
         assert follow(frames[1][0]).confidence == pytest.approx(0.3)
     with monkeypatch.context() as patch:
-        patch.setattr(tracking, "refine_item", LOST)
+        patch.setattr(tracking, "refine_one", LOST)
         assert follow(frames[2][0]).confidence <= 0.3
     confirmed = follow(frames[3][0])
     assert confirmed.confidence > BELIEVED_CONFIDENCE
     assert errors(confirmed, frames[3][2])[0] < 4.0
-    monkeypatch.setattr(tracking, "refine_item", LOST)
+    monkeypatch.setattr(tracking, "refine_one", LOST)
     assert follow(frames[4][0]).confidence > BELIEVED_CONFIDENCE, "tracked from the confirmed pose"
 
 
@@ -214,10 +214,10 @@ def test_follower_refines_where_tracking_is_doubtful(monkeypatch):
         example_mesh(), jumped, CAMERA, SIZE, torch.Generator().manual_seed(9)
     )[0]
     calls = []
-    refine_item = tracking.refine_item
+    refine_one = tracking.refine_one
     monkeypatch.setattr(tracking, "TRUSTED_CONFIDENCE", 1.1)  # whatever the tracker says
     monkeypatch.setattr(
-        tracking, "refine_item", lambda *a, **k: calls.append(a) or refine_item(*a, **k)
+        tracking, "refine_one", lambda *a, **k: calls.append(a) or refine_one(*a, **k)
     )
     follow = Follower(truck_registrar(), CAMERA)
     follow.start(image, T)
@@ -233,7 +233,7 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
     monkeypatch.setattr(
         "curvireg_torch.registration.tracking.tracking_confidence", lambda _: tracked
     )
-    monkeypatch.setattr(tracking, "refine_item", LOST)
+    monkeypatch.setattr(tracking, "refine_one", LOST)
     monkeypatch.setattr(
         Registrar, "__call__", lambda *_, **__: [FailedRegistration(LostObjectError("no"))]
     )
@@ -249,7 +249,7 @@ def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, 
     follow = Follower(registrar, CAMERA)
     follow.start(frames[0][0], frames[0][2])
     monkeypatch.setattr("curvireg_torch.registration.tracking.tracking_confidence", lambda _: 0.1)
-    monkeypatch.setattr(tracking, "refine_item", LOST)
+    monkeypatch.setattr(tracking, "refine_one", LOST)
     answering(monkeypatch, registrar, [confidence])
     result = follow(*frames[1][:2])
     assert result.ok == used
@@ -283,9 +283,9 @@ def test_frames_below_one_half_are_checked_and_a_start_of_no_confidence_is_kept(
         calls = []
         follow = Follower(learned_registrar(), CAMERA)
         follow.start(frames[0][0], frames[0][2], confidence=confidence)
-        refined = tracking.refine_item
+        refined = tracking.refine_one
         monkeypatch.setattr(
-            tracking, "refine_item", lambda *a, f=refined, c=calls: (c.append(1), f(*a))[1]
+            tracking, "refine_one", lambda *a, f=refined, c=calls: (c.append(1), f(*a))[1]
         )
         monkeypatch.setattr(
             follow, "_registered", lambda *_: pytest.fail("the given pose was dropped")

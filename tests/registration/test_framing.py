@@ -16,7 +16,7 @@ from curvireg_torch.geometry.framing import (
 )
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.registration.judging import outside_warnings
-from curvireg_torch.registration.photograph import image_item
+from curvireg_torch.registration.photograph import as_photograph
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene
 
 SQUARE = torch.from_numpy(trimesh.creation.box((1.0, 1.0, 0.001)).vertices.copy())
@@ -64,7 +64,7 @@ def test_warnings_begin_at_a_tenth():
     ],
 )
 def test_boxes_are_clipped_to_the_photograph(box, part, sides):
-    item = image_item(torch.rand(3, 80, 100), torch.tensor(box, dtype=torch.float32))
+    item = as_photograph(torch.rand(3, 80, 100), torch.tensor(box, dtype=torch.float32))
     assert (
         item.box.tolist() == list(part) == clipped(torch.tensor(box).double(), (80, 100)).tolist()
     )

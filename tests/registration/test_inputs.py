@@ -11,7 +11,7 @@ from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration import Registrar, stages
 from curvireg_torch.registration import photograph as photograph_module
-from curvireg_torch.registration.photograph import ImageItem, camera_warnings, image_items
+from curvireg_torch.registration.photograph import Photograph, as_photographs, camera_warnings
 from tests._support.scenes import (
     CAMERA,
     SIZE,
@@ -58,8 +58,8 @@ def test_cameras_and_boxes_that_look_like_mistakes_are_questioned_or_refused():
         ([10, 400, 200, 491.5], False, False),
     ):
         picture = torch.rand(1, *VGA)
-        assert bool(ImageItem(picture, torch.tensor(box).float(), None).warnings) == warned
-        item = image_items([picture], [box], None)[0]
+        assert bool(Photograph(picture, torch.tensor(box).float(), None).warnings) == warned
+        item = as_photographs([picture], [box], None)[0]
         assert isinstance(item, InvalidInputError) == refused
         assert not refused or "at least 12 are needed" in str(item)
 

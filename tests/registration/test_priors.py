@@ -17,7 +17,7 @@ from curvireg_torch.geometry import (
 from curvireg_torch.geometry.pose_prior import PosePrior
 from curvireg_torch.registration.block import Limits
 from curvireg_torch.registration.hypotheses import Hypotheses
-from curvireg_torch.registration.photograph import ImageItem
+from curvireg_torch.registration.photograph import Photograph
 from tests._support.scenes import CAMERA, learned_registrar, scene, truck_bank, truck_registrar
 
 IMAGE, BOX, T = scene(0)
@@ -52,7 +52,7 @@ def test_each_photograph_has_its_own_prior_which_may_leave_no_view():
 
 
 def limits_of(prior, box=(100.0, 60.0, 140.0, 100.0)):
-    item = ImageItem(torch.rand(3, 180, 240), torch.tensor(box), CAMERA, prior)
+    item = Photograph(torch.rand(3, 180, 240), torch.tensor(box), CAMERA, prior)
     return Limits(item, truck_bank())
 
 

@@ -27,7 +27,7 @@ from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import FailedRegistration, Follower, block, hypotheses, stages
 from curvireg_torch.registration import block as described_module
 from curvireg_torch.registration import registrar as registrar_module
-from curvireg_torch.registration.photograph import ImageItem, check_crop
+from curvireg_torch.registration.photograph import Photograph, check_crop
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import (
@@ -141,7 +141,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
     """Without it, only views beyond 50 degrees are too far: from one 21 degrees off the true pose,
     which is 30 degrees from the best view, the fit ends 0.8 degrees off all the same."""
     registrar = truck_registrar(fit=FitSettings(screening_weight=weight))
-    item = ImageItem(IMAGE, BOX, CAMERA)
+    item = Photograph(IMAGE, BOX, CAMERA)
     query = registrar.matcher.query([IMAGE], BOX[None])
     ranking = registrar.matcher.rank(query)
     bank = registrar.bank
@@ -442,7 +442,7 @@ def test_boxes_are_compared_inside_the_photograph():
         # outside: not used
         ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),
     ):
-        item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
+        item = Photograph(torch.zeros(3, *size), torch.tensor(given), CAMERA)
         assert item.shows_other_part(torch.tensor(box, dtype=torch.float64)) == expected
 
 

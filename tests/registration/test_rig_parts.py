@@ -171,7 +171,8 @@ def test_a_pose_is_seen_where_its_box_overlaps_that_of_the_photograph(monkeypatc
     ).double()
     in_front = torch.tensor([True, True, True, False])
     monkeypatch.setattr(rig_module, "boxes_at", lambda *_: (boxes, in_front))
-    one: Any = SimpleNamespace(camera=ORIGIN, K=None, size=(20, 20), box=boxes[0])
+    photograph = SimpleNamespace(K=None, size=(20, 20), box=boxes[0])
+    one: Any = SimpleNamespace(camera=ORIGIN, photograph=photograph)
     hull: Any = None
     # the second overlaps by a third, the third by a quarter
     assert RigPhotograph.sees(one, hull, ORIGIN.repeat(4, 1, 1)).tolist() == [

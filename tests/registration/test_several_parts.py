@@ -40,10 +40,10 @@ def photograph(index: int, **changes: Any) -> Any:
         result=SimpleNamespace(**result),
         poses=torch.full((2, 4, 4), angle),
         camera=EYE,
-        K=torch.eye(3).double(),
-        size=(100, 200),
         printed=lambda _: 0.0,
-        box=torch.tensor([10.0, 10.0, 50.0, 50.0]),
+        photograph=SimpleNamespace(
+            K=torch.eye(3).double(), size=(100, 200), box=torch.tensor([10.0, 10.0, 50.0, 50.0])
+        ),
     )
 
 

@@ -23,7 +23,7 @@ from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.block import Block
 from curvireg_torch.registration.hypotheses import Hypotheses
-from curvireg_torch.registration.photograph import ImageItem
+from curvireg_torch.registration.photograph import Photograph
 from tests._support.scenes import CAMERA, SIZE
 
 NOTHING: Any = None
@@ -58,7 +58,7 @@ def test_cameras_that_are_tried_have_all_fields_of_view():
 def test_the_angle_to_the_centre_of_the_box():
     K = CAMERA.clone()
     box = torch.tensor([119.5 + 100, 89.5 - 20, 119.5 + 160, 89.5 + 20])
-    item = ImageItem(torch.zeros(3, *SIZE), box, K)
+    item = Photograph(torch.zeros(3, *SIZE), box, K)
     assert camera_module.off_axis_angle(item) == pytest.approx(
         math.degrees(math.atan(130.0 / 260.0))
     )
@@ -98,7 +98,7 @@ def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source
     monkeypatch.setattr(camera_module, "fit_focal_length", fit)
     monkeypatch.setattr(camera_module, "measured_fit", measured)
     describer: Any = SimpleNamespace(contours=None, centre=CENTRE)
-    item = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA)
+    item = Photograph(torch.zeros(3, *SIZE), BOX, CAMERA)
     item = replace(item, camera_source=source, focal_deviation=0.1)
     found = camera_module.with_focal_length(describer, NOTHING, poses, item)
     assert fitted == factors
@@ -117,7 +117,7 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
     monkeypatch.setattr(camera_module.ContourProblem, "of", lambda *_: problem)
     monkeypatch.setattr(camera_module, "focal_information", lambda *_: (information, motion))
     describer: Any = SimpleNamespace(contours=None, centre=CENTRE)
-    item = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA)
+    item = Photograph(torch.zeros(3, *SIZE), BOX, CAMERA)
     item = replace(item, focal_deviation=0.2)
     covariance, deviation = camera_module.focal_covariance(describer, NOTHING, pose, item)
     measured = camera_module.REPORTED_VARIANCE * 0.04
@@ -212,7 +212,7 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
     best = torch.full((1, 6, 6), 2.0, dtype=torch.float64)
     monkeypatch.setattr(camera_module, "focal_covariance", lambda *_: (best, 0.07))
     target: Any = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), describer=None)
-    item = replace(ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA), focal_deviation=0.1)
+    item = replace(Photograph(torch.zeros(3, *SIZE), BOX, CAMERA), focal_deviation=0.1)
     given: dict[str, Any] = {field.name: None for field in fields(Block)}
     block = Block(**given | {"photographs": [item]})
     outside = torch.tensor([False, False, True])
@@ -228,13 +228,13 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
 def test_limits_of_an_unknown_camera_are_wider_by_how_far_the_box_is_off_the_axis(monkeypatch):
     made: list[tuple[Any, float]] = []
 
-    def limits(item: ImageItem, _: Any, off_centre: float = 0.0) -> str:
+    def limits(item: Photograph, _: Any, off_centre: float = 0.0) -> str:
         made.append((item.camera_matrix, off_centre))
         return "limits"
 
     monkeypatch.setattr(camera_module, "Limits", limits)
     prior: Any = SimpleNamespace(distance=None)
-    known = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA, prior)
+    known = Photograph(torch.zeros(3, *SIZE), BOX, CAMERA, prior)
     unknown = replace(known, camera_matrix=None)
     target: Any = SimpleNamespace(bank=None, is_exact=True)
     similar: Any = SimpleNamespace(bank=None, is_exact=False)

@@ -36,7 +36,7 @@ def test_a_process_that_ends_is_an_error():
     registrar = Registrar(truck_bank(), workers=2)
     items = [EndsItsProcess(), EndsItsProcess()]
     with pytest.raises(WorkerError, match="a process ended"):
-        registrar.register_items(items)
+        registrar.register_prepared(items)
     images = [scene(0)[0]] * 2
     results = registrar(images, scene(0)[1].expand(2, 4), CAMERA)  # by new processes
     assert all(result.ok for result in results)
