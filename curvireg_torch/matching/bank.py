@@ -26,6 +26,7 @@ from ..mesh.mesh import (
     as_mesh,
     checked_triangles,
     extreme_points,
+    measures_of,
     mesh_radius,
     mesh_unit,
     mesh_up,
@@ -420,12 +421,11 @@ def _pack(mask: Tensor) -> Tensor:
 
 def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
     mesh = _triangles(tensors, "mesh")
-    mesh._cache.update(
-        {n: tensors[n] for n in ("extreme_points", "mesh_symmetries") if n in tensors}
-    )
+    measures = measures_of(mesh)
+    measures |= {n: tensors[n] for n in ("extreme_points", "mesh_symmetries") if n in tensors}
     if len(mesh.faces) > VIEW_FACES:
-        mesh._cache["view_mesh"] = _triangles(tensors, "view_mesh")
-    mesh._cache["reflection_plane"] = _plane(tensors["reflection_plane"])
+        measures["view_mesh"] = _triangles(tensors, "view_mesh")
+    measures["reflection_plane"] = _plane(tensors["reflection_plane"])
     _check_extreme_points(mesh)
     check_option(up, UP_AXES, "up")
     if unit:

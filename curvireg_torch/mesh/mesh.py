@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import wraps
 from os import PathLike
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -299,16 +299,38 @@ def mirrored(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, mesh.faces[:, [0, 2, 1]], process=False)
 
 
+def measures_of(mesh: trimesh.Trimesh) -> dict[str, Any]:
+    """What is known of a mesh with these vertices and faces, by the names of the functions that
+    measure it; it travels with the mesh, as its metadata do. Banks store such values.
+
+    Example:
+        >>> import trimesh
+        >>> mesh = trimesh.creation.box()
+        >>> points, known = extreme_points(mesh), list(measures_of(mesh))
+        >>> known, list(measures_of(mesh.apply_scale(2.0)))
+        (['extreme_points'], [])
+    """
+    geometry = hash(mesh)
+    of_geometry, known = mesh.metadata.get("measures", (None, {}))
+    if of_geometry != geometry:
+        known = {}
+        mesh.metadata["measures"] = geometry, known
+    return cast(dict[str, Any], known)
+
+
 def cached_in_mesh(
     function: Callable[[trimesh.Trimesh], Found],
 ) -> Callable[[trimesh.Trimesh], Found]:
-    """Decorate a function of a mesh whose value stays in trimesh's cache, by the function's name,
-    until vertices or faces change; callers get copies of tensors. Banks store such values."""
-    cached = trimesh.caching.cache_decorator(function).fget
+    """Decorate a function of a mesh whose value is one of :func:`measures_of` it; callers get
+    copies of tensors."""
+    name = function.__name__
 
     @wraps(function)
     def value_of(mesh: trimesh.Trimesh) -> Found:
-        value = cached(mesh)
+        known = measures_of(mesh)
+        if name not in known:
+            known[name] = function(mesh)
+        value = known[name]
         return cast(Found, value.clone() if isinstance(value, Tensor) else value)
 
     return value_of

@@ -1,3 +1,4 @@
+import pickle
 import warnings
 from pathlib import Path
 
@@ -11,7 +12,13 @@ import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.mesh import normalization_transform
 from curvireg_torch.mesh.edges import MeshEdges, encloses_volumes, simplified
-from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up, principal_rotation
+from curvireg_torch.mesh.mesh import (
+    as_mesh,
+    extreme_points,
+    measures_of,
+    mesh_up,
+    principal_rotation,
+)
 from curvireg_torch.rendering.contours import MeshContours
 
 
@@ -206,3 +213,15 @@ def test_bytes_of_the_files_beside_a_mesh_are_bounded_together(
     path.write_text(path.read_text().replace("1.mtl", "1.mtl 2.mtl"))
     with pytest.raises(MeshError, match="the files that it names hold more than 1,000 bytes"):
         cr.load_mesh(path)
+
+
+def test_measures_are_those_of_the_mesh_as_it_is_now():
+    mesh = trimesh.creation.box((1.0, 2.0, 3.0))
+    extreme_points(mesh).zero_()
+    points = extreme_points(mesh)
+    assert float(points.abs().max()) == 1.5, "callers have copies"
+    known = measures_of(pickle.loads(pickle.dumps(mesh)))
+    assert torch.equal(known["extreme_points"], points), "they travel with the mesh"
+    mesh.vertices *= 2.0
+    assert measures_of(mesh) == {}
+    assert torch.equal(extreme_points(mesh), 2.0 * points)
