@@ -4,6 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+__all__ = ["CALIBRATION", "COVARIANCE_SCALE"]
+
 # For each model its ``weights`` and ``bias``; for "instance" and "category" also ``slope`` and
 # ``resolution``, see
 # :func:`curvireg_torch.registration.confidence.shares`

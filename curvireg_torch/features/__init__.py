@@ -4,10 +4,15 @@ Descriptors keep the dtype (half types compute in float32). Wrong shapes, dtypes
 :class:`~curvireg_torch.errors.InvalidInputError`.
 """
 
-from .hog import HOG as HOG
-from .hog import field_points as field_points
-from .hog import hog as hog
-from .learned_field import FieldNetwork as FieldNetwork
-from .learned_field import LearnedCurvilinearSaliency as LearnedCurvilinearSaliency
-from .learned_field import doubled_angle as doubled_angle
-from .learned_field import halved_angle as halved_angle
+from .hog import HOG, field_points, hog
+from .learned_field import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle, halved_angle
+
+__all__ = [
+    "HOG",
+    "FieldNetwork",
+    "LearnedCurvilinearSaliency",
+    "doubled_angle",
+    "field_points",
+    "halved_angle",
+    "hog",
+]

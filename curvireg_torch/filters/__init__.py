@@ -10,26 +10,55 @@ on a CPU where gradients are wanted, sums of shifted images give the same in les
 (``docs/kornia.md`` has the measurements).
 """
 
-from .curvilinear import DepthCurvilinearSaliency as DepthCurvilinearSaliency
-from .curvilinear import ImageCurvilinearSaliency as ImageCurvilinearSaliency
-from .curvilinear import ImageGradient as ImageGradient
-from .curvilinear import PrincipalCurvatureImage as PrincipalCurvatureImage
-from .curvilinear import depth_curvilinear_saliency as depth_curvilinear_saliency
-from .curvilinear import image_curvilinear_saliency as image_curvilinear_saliency
-from .curvilinear import image_gradient as image_gradient
-from .curvilinear import principal_curvature_image as principal_curvature_image
-from .focus import EdgeBlur as EdgeBlur
-from .focus import MultiScaleFocusCurves as MultiScaleFocusCurves
-from .focus import edge_blur as edge_blur
-from .focus import multiscale_focus_curves as multiscale_focus_curves
-from .multiscale import AnisotropicDiffusion as AnisotropicDiffusion
-from .multiscale import MultiScaleCurvilinearSaliency as MultiScaleCurvilinearSaliency
-from .multiscale import anisotropic_diffusion as anisotropic_diffusion
-from .multiscale import multiscale_curvilinear_saliency as multiscale_curvilinear_saliency
-from .operations import gaussian_smooth as gaussian_smooth
-from .shading import ApparentRidges as ApparentRidges
-from .shading import AverageShadingGradient as AverageShadingGradient
-from .shading import HessianFrobeniusNorm as HessianFrobeniusNorm
-from .shading import apparent_ridges as apparent_ridges
-from .shading import average_shading_gradient as average_shading_gradient
-from .shading import hessian_frobenius_norm as hessian_frobenius_norm
+from .curvilinear import (
+    DepthCurvilinearSaliency,
+    ImageCurvilinearSaliency,
+    ImageGradient,
+    PrincipalCurvatureImage,
+    depth_curvilinear_saliency,
+    image_curvilinear_saliency,
+    image_gradient,
+    principal_curvature_image,
+)
+from .focus import EdgeBlur, MultiScaleFocusCurves, edge_blur, multiscale_focus_curves
+from .multiscale import (
+    AnisotropicDiffusion,
+    MultiScaleCurvilinearSaliency,
+    anisotropic_diffusion,
+    multiscale_curvilinear_saliency,
+)
+from .operations import gaussian_smooth
+from .shading import (
+    ApparentRidges,
+    AverageShadingGradient,
+    HessianFrobeniusNorm,
+    apparent_ridges,
+    average_shading_gradient,
+    hessian_frobenius_norm,
+)
+
+__all__ = [
+    "AnisotropicDiffusion",
+    "ApparentRidges",
+    "AverageShadingGradient",
+    "DepthCurvilinearSaliency",
+    "EdgeBlur",
+    "HessianFrobeniusNorm",
+    "ImageCurvilinearSaliency",
+    "ImageGradient",
+    "MultiScaleCurvilinearSaliency",
+    "MultiScaleFocusCurves",
+    "PrincipalCurvatureImage",
+    "anisotropic_diffusion",
+    "apparent_ridges",
+    "average_shading_gradient",
+    "depth_curvilinear_saliency",
+    "edge_blur",
+    "gaussian_smooth",
+    "hessian_frobenius_norm",
+    "image_curvilinear_saliency",
+    "image_gradient",
+    "multiscale_curvilinear_saliency",
+    "multiscale_focus_curves",
+    "principal_curvature_image",
+]

@@ -12,31 +12,62 @@ Conventions of the whole library (pinned by ``tests/geometry``):
   rotates nothing.
 """
 
-from .calibration import Camera as Camera
-from .calibration import undistorted as undistorted
-from .cameras import camera_matrix as camera_matrix
-from .cameras import pose_from_box as pose_from_box
-from .cameras import project_points as project_points
-from .cameras import projected_boxes as projected_boxes
-from .cameras import rotation_towards as rotation_towards
-from .cameras import transform as transform
-from .conversions import axis_angle_from_rotation as axis_angle_from_rotation
-from .conversions import opencv_from_opengl as opencv_from_opengl
-from .conversions import opengl_from_opencv as opengl_from_opencv
-from .conversions import rotation_from_axis_angle as rotation_from_axis_angle
-from .conversions import symmetry_transforms as symmetry_transforms
-from .crops import box_iou as box_iou
-from .crops import crop_images as crop_images
-from .crops import crop_transforms as crop_transforms
-from .crops import square_boxes as square_boxes
-from .crops import whole_image_box as whole_image_box
-from .pose_prior import PosePrior as PosePrior
-from .pose_prior import object_frame as object_frame
-from .viewpoint import ViewSphere as ViewSphere
-from .viewpoint import paper_views as paper_views
-from .viewpoint import rotation_error as rotation_error
-from .viewpoint import rotation_from_viewpoint as rotation_from_viewpoint
-from .viewpoint import sample_views as sample_views
-from .viewpoint import uniform_views as uniform_views
-from .viewpoint import up_rotation as up_rotation
-from .viewpoint import viewpoint_from_rotation as viewpoint_from_rotation
+from .calibration import Camera, undistorted
+from .cameras import (
+    camera_matrix,
+    pose_from_box,
+    project_points,
+    projected_boxes,
+    rotation_towards,
+    transform,
+)
+from .conversions import (
+    axis_angle_from_rotation,
+    opencv_from_opengl,
+    opengl_from_opencv,
+    rotation_from_axis_angle,
+    symmetry_transforms,
+)
+from .crops import box_iou, crop_images, crop_transforms, square_boxes, whole_image_box
+from .pose_prior import PosePrior, object_frame
+from .viewpoint import (
+    ViewSphere,
+    paper_views,
+    rotation_error,
+    rotation_from_viewpoint,
+    sample_views,
+    uniform_views,
+    up_rotation,
+    viewpoint_from_rotation,
+)
+
+__all__ = [
+    "Camera",
+    "PosePrior",
+    "ViewSphere",
+    "axis_angle_from_rotation",
+    "box_iou",
+    "camera_matrix",
+    "crop_images",
+    "crop_transforms",
+    "object_frame",
+    "opencv_from_opengl",
+    "opengl_from_opencv",
+    "paper_views",
+    "pose_from_box",
+    "project_points",
+    "projected_boxes",
+    "rotation_error",
+    "rotation_from_axis_angle",
+    "rotation_from_viewpoint",
+    "rotation_towards",
+    "sample_views",
+    "square_boxes",
+    "symmetry_transforms",
+    "transform",
+    "undistorted",
+    "uniform_views",
+    "up_rotation",
+    "viewpoint_from_rotation",
+    "whole_image_box",
+]

@@ -1,5 +1,6 @@
 """What is to be expected of a mesh before a photograph is taken: its state, views that look alike,
 and a trial."""
 
-from .report import Inspection as Inspection
-from .report import inspect as inspect
+from .report import Inspection, inspect
+
+__all__ = ["Inspection", "inspect"]

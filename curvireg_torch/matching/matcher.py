@@ -29,16 +29,15 @@ from ..terms import (
     whole_box_shapes,
 )
 from ..utils.checks import as_boxes, check_pixels
+from ..utils.computed import without_computed
 from ..utils.files import text_digest
 from ..utils.likes import BoxesLike
-from ..utils.precision import in_full_precision
+from ..utils.precision import full_precision, in_full_precision
 from ..utils.threads import map_on_threads
 from .bank import ViewBank, packed, views_at_a_time
 from .cells import ROUNDING_OF_TRACE, DescribedViews, best_cells
 from .describe import ViewDescriber, hog_layer
 
-# attributes that follow from bank and pipeline
-_PREPARED = ("_terms", "_described_views", "describer")
 # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 NEAR_TRACE = 1.0 + 3.0**0.5
 
@@ -166,22 +165,22 @@ class ViewMatcher(nn.Module):
             None,
         )
         self._appearance = None if appearance is None else appearance.build().to(bank.device)
-        self._prepare()
+        _ = self._terms
 
-    @in_full_precision
-    def _prepare(self) -> None:
-        """Compute from bank and pipeline what is on the bank's device, and is not copied."""
-        for name in _PREPARED:
-            self.__dict__.pop(name, None)
-        self._described_views = DescribedViews(self._described_views_file())
-        terms = [
-            term
-            for term in self.pipeline.terms
-            if term.weight > 0 and not isinstance(term, Appearance)
-        ]
-        self._terms: list[tuple[Term, Comparison]] = [
-            (term, term.build(self.bank)) for term in terms
-        ]
+    @cached_property
+    def _terms(self) -> list[tuple[Term, Comparison]]:
+        """Terms but appearance, and how they compare, on the bank's device."""
+        counting = [term for term in self.pipeline.terms if term.weight > 0]
+        with full_precision():
+            return [
+                (term, term.build(self.bank))
+                for term in counting
+                if not isinstance(term, Appearance)
+            ]
+
+    @cached_property
+    def _described_views(self) -> DescribedViews:
+        return DescribedViews(self._described_views_file())
 
     def _described_views_file(self) -> Path | None:
         """Where features of pictures that this renderer draws of a cached bank are kept. Other
@@ -203,12 +202,14 @@ class ViewMatcher(nn.Module):
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         if moved.device != self.bank.device:
             self.bank = self.bank.to(moved.device)
+            for name in vars(self).keys() - without_computed(self).keys():
+                delattr(self, name)
             self._prepare_on_one_thread()
         return self
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is computed from the rest: comparisons and renderers cannot be pickled."""
-        return {name: x for name, x in self.__dict__.items() if name not in _PREPARED}
+        return without_computed(self)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
@@ -217,7 +218,7 @@ class ViewMatcher(nn.Module):
     def _prepare_on_one_thread(self) -> None:
         """Whatever number of threads torch has, rounding is that of a matcher which the registrar
         built."""
-        map_on_threads(lambda _: self._prepare(), [0])
+        map_on_threads(lambda _: self._terms, [0])
 
     def forward(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> Ranking:
         """Rank all views.

@@ -22,6 +22,7 @@ from ..mesh.mesh import mirrored
 from ..mesh.round_axis import RoundAxis, round_axis
 from ..mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from ..terms import QueryFeatures
+from ..utils.computed import without_computed
 from .photograph import Photograph
 
 # Symmetries that are compared, the identity among them: every 30 degrees of a body of revolution
@@ -110,11 +111,7 @@ class Target:
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what follows from the rest: renderers cannot be pickled."""
-        of_classes = [vars(one).items() for one in type(self).__mro__]
-        computed = {
-            name for items in of_classes for name, x in items if isinstance(x, cached_property)
-        }
-        return {name: value for name, value in vars(self).items() if name not in computed}
+        return without_computed(self)
 
     def __copy__(self) -> Self:
         """With what was computed: it follows from the mesh, which a copy shares."""

@@ -13,8 +13,7 @@ import argparse
 import json
 import statistics
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from torch import Tensor
 import curvireg_torch as cr
 from curvireg_torch.matching import ViewMatcher
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from curvireg_torch.utils import company
 from scripts import _shared
 from scripts.speed.speed import CAMERA, dented_sphere
 
@@ -121,9 +119,7 @@ def measure(options: argparse.Namespace, record: Callable[[str, Any], None]) -> 
         seconds = seconds_of(lambda n=number: register(new, 0, n), device)  # type: ignore[misc]
         measured = {"seconds": seconds, "photographs_per_second": number / seconds}
         record(f"register_{together}", measured)
-    with timed_stages(device) as stages:
-        results = register(new, 0, count)
-    record("stages", stages)
+    results = register(new, 0, count)
     record("accuracy", accuracy(results, new.poses))
     alone = [register(new, k, k + 1)[0] for k in range(min(AGREE, count))]
     record("degrees_alone_and_together", degrees(alone, results[: len(alone)]))
@@ -151,28 +147,6 @@ def measure(options: argparse.Namespace, record: Callable[[str, Any], None]) -> 
     errors = degrees(results[:number], expected)
     known = [error for error in errors if error is not None]
     record("degrees_from_cpu", {"each": errors, "median": statistics.median(known or [180.0])})
-
-
-@contextmanager
-def timed_stages(device: str) -> Iterator[dict[str, float]]:
-    """Seconds of what photographs compute together, by the name of the function."""
-    seconds: dict[str, float] = {}
-    compute = company._compute
-
-    def timed(places: Any) -> Any:
-        finish(device)
-        start = time.perf_counter()
-        result = compute(places)
-        finish(device)
-        name = places[0].function.__name__
-        seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
-        return result
-
-    company._compute = timed  # type: ignore[assignment]
-    try:
-        yield seconds
-    finally:
-        company._compute = compute
 
 
 def main() -> None:

@@ -2,9 +2,11 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from curvireg_torch import Pipeline
 from curvireg_torch.geometry.framing import CropFrame
@@ -13,6 +15,11 @@ from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration.block import Described, counting_keypoints, evidence_of
 from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene
+
+
+def frame_of(target: Any, box: Tensor) -> CropFrame:
+    settings = target.bank.settings
+    return CropFrame.of(box, SIZE, side=settings.image_size, margin=settings.margin)
 
 
 @pytest.mark.parametrize(("chance", "expected"), [(2, [0.0, 0.0, 1.0, 20.0]), (0, [0, 2, 3, 22])])
@@ -36,7 +43,7 @@ def test_what_lies_outside_the_photograph_is_not_compared():
     poses = Hypotheses.at(
         T[None], CAMERA[None], target.describer.centre, nothing.long(), nothing.double()
     )
-    frame = CropFrame.of(box, SIZE, target.bank.settings)
+    frame = frame_of(target, box)
     (field,), _ = target.describer.seen_by(T[None], (frame.transform @ CAMERA)[None], shaded=False)
     photograph = Described(
         query=None,
@@ -61,7 +68,7 @@ def test_poses_in_frames_and_poses_by_themselves_keep_their_order():
     poses = Hypotheses.at(
         turned, CAMERA.expand(4, 3, 3), target.describer.centre, none.long(), none, photograph
     )
-    frame = CropFrame.of(box, SIZE, target.bank.settings)
+    frame = frame_of(target, box)
     (field,), _ = target.describer.seen_by(T[None], (frame.transform @ CAMERA)[None], shaded=False)
     descriptor = target.describer.descriptor(field[None]).expand(2, -1)
     two = Described(

@@ -14,7 +14,6 @@ from curvireg_torch.geometry.framing import (
     shown_in,
     whole_boxes,
 )
-from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.registration.judging import outside_warnings
 from curvireg_torch.registration.photograph import as_photograph
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene
@@ -106,9 +105,8 @@ def test_whole_boxes_go_on_beyond_the_border_alone():
 
 def test_frame_knows_what_of_a_crop_lies_in_the_photograph():
     # a square of 80 px without margin that goes on for 20 px to the left and 30 px below
-    settings = BankSettings(image_size=16, margin=0.0)
     box = torch.tensor([-20.5, 49.5, 59.5, 129.5])
-    frame = CropFrame.of(box, (100, 200), settings)
+    frame = CropFrame.of(box, (100, 200), side=16, margin=0.0)
     corners = torch.tensor([[-20.5, 49.5, 1.0], [59.5, 129.5, 1.0]]).double()
     expected = torch.tensor([[-0.5, -0.5, 1.0], [15.5, 15.5, 1.0]]).double()
     torch.testing.assert_close(corners @ frame.transform.T, expected)

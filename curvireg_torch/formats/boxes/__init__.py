@@ -1,7 +1,6 @@
 """Boxes of detectors and of annotation tools."""
 
-from .files import ImageBox as ImageBox
-from .files import read_boxes as read_boxes
-from .finder import BoxFile as BoxFile
-from .finder import PictureSize as PictureSize
-from .finder import pixel_box as pixel_box
+from .files import ImageBox, read_boxes
+from .finder import BoxFile, PictureSize, pixel_box
+
+__all__ = ["BoxFile", "ImageBox", "PictureSize", "pixel_box", "read_boxes"]

@@ -1,5 +1,6 @@
 """Cameras of calibration files."""
 
-from .files import CameraFiles as CameraFiles
-from .files import read_camera as read_camera
-from .record import CameraRecord as CameraRecord
+from .files import CameraFiles, read_camera
+from .record import CameraRecord
+
+__all__ = ["CameraFiles", "CameraRecord", "read_camera"]

@@ -1,0 +1,59 @@
+"""What packages export: no name is public by accident."""
+
+import ast
+import importlib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "curvireg_torch"
+INITS = sorted(PACKAGE.rglob("__init__.py"))
+
+
+def dotted(path: Path) -> str:
+    """The name of a module, or of a package by its ``__init__.py``."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(part for part in parts if part != "__init__")
+
+
+def imported(tree: ast.Module, module: str, *, is_package: bool) -> list[tuple[str, str]]:
+    """The (module, name) pairs of ``from module import name``, relative ones made absolute."""
+    here = module.split(".")
+    pairs = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            above = here[: len(here) - node.level + is_package] if node.level else []
+            source = ".".join([*above, *([node.module] if node.module else [])])
+            pairs += [(source, alias.name) for alias in node.names]
+    return pairs
+
+
+@pytest.mark.parametrize("path", INITS, ids=dotted)
+def test_packages_list_what_they_export(path: Path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    package = importlib.import_module(dotted(path))
+    public = {
+        name
+        for source, name in imported(tree, dotted(path), is_package=True)
+        if source.startswith("curvireg_torch") and not (path.parent / f"{name}.py").exists()
+    }
+    exported = getattr(package, "__all__", [])
+    assert not public - set(exported) - {"__version__"} or path.parent.name == "cli"
+    assert [name for name in exported if not hasattr(package, name)] == []
+
+
+def test_names_of_packages_are_those_that_they_export():
+    exports = {dotted(path): importlib.import_module(dotted(path)) for path in INITS}
+    wrong = []
+    for folder in ("curvireg_torch", "tests", "scripts"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            is_package = path.name == "__init__.py"
+            for source, name in imported(tree, dotted(path), is_package=is_package):
+                if source not in exports or name in getattr(exports[source], "__all__", ()):
+                    continue
+                beside = ROOT.joinpath(*source.split("."), name)
+                if not (beside.is_dir() or beside.with_suffix(".py").exists()):
+                    wrong.append(f"{path.relative_to(ROOT)}: {source}.{name}")
+    assert wrong == []
