@@ -12,7 +12,6 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..evidence import Evidence
 from ..fitting.details import compared, contour_details
-from ..fitting.devices import on_device
 from ..fitting.edges import EdgeCrops
 from ..fitting.keypoints import KeypointMatches
 from ..fitting.measured_fit import contour_evidence, measure_contours
@@ -23,7 +22,7 @@ from ..matching import Ranking, ViewBank
 from ..mesh import mesh_up
 from ..mesh.mesh import mesh_centre, mesh_radius
 from ..terms import Appearance, QueryFeatures
-from .hypotheses import Hypotheses, fit_poses, placed
+from .hypotheses import Hypotheses, by_contours, fit_poses, placed
 from .photograph import Photograph
 from .target import Target, nearest_view
 
@@ -263,9 +262,7 @@ def _contours(target: Target, described: Described, poses: Hypotheses) -> Tensor
     """(N,) see :func:`.contour_evidence`; 0 without the contour fit."""
     if described.crops is None:
         return torch.zeros(len(poses), dtype=torch.float64)
-    contours = target.describer.device_contours
-    given = poses.cameras, poses.T, poses.photograph
-    return on_device(contour_evidence, contours, described.crops, *given)
+    return by_contours(contour_evidence, target.describer, described.crops, poses)
 
 
 def with_details(
@@ -275,9 +272,7 @@ def with_details(
     photograph."""
     index = torch.cat([best, rivals])
     some = poses[index]
-    contours = target.describer.device_contours
-    given = some.cameras, some.T, some.photograph
-    seen = on_device(contour_details, contours, crops, *given)
+    seen = by_contours(contour_details, target.describer, crops, some)
     details = poses.evidence.details.clone()
     for place, row in enumerate(best.tolist()):
         others = (some.photograph == poses.photograph[row]).nonzero()[:, 0]
@@ -407,6 +402,5 @@ def fitted_poses(
     if not len(left):
         return poses
     kept = starts[left]
-    given = kept.cameras, kept.T, kept.photograph
-    seen = on_device(measure_contours, target.describer.device_contours, crops, *given)
+    seen = by_contours(measure_contours, target.describer, crops, kept)
     return poses.replaced(left, kept.with_fit(seen, target.describer.centre))

@@ -2,9 +2,9 @@
 filled from views, fits and boxes."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ from .result import Hypothesis
 __all__ = [
     "Hypotheses",
     "best_views",
+    "by_contours",
     "close_rivals",
     "common_score",
     "distinct_poses",
@@ -38,6 +39,8 @@ __all__ = [
     "with_edge_support",
     "with_short_fit",
 ]
+
+Measured = TypeVar("Measured")
 
 
 @dataclass(frozen=True)
@@ -210,6 +213,19 @@ def best_views(
     return view, log[view] - log.max()
 
 
+def by_contours(
+    function: Callable[..., Measured],
+    describer: ViewDescriber,
+    crops: EdgeCrops,
+    poses: Hypotheses,
+    **options: Any,
+) -> Measured:
+    """``function`` of the mesh's contours, of crops, and of the cameras, poses and photographs of
+    hypotheses, see :func:`.on_device`."""
+    given = poses.cameras, poses.T, poses.photograph
+    return on_device(function, describer.device_contours, crops, *given, **options)
+
+
 def fit_poses(
     describer: ViewDescriber,
     crops: EdgeCrops,
@@ -219,9 +235,9 @@ def fit_poses(
     **options: Any,
 ) -> Hypotheses:
     """Fit the contours of poses to crops, see :func:`fit_to_edges` and its ``options``."""
-    given = describer.device_contours, crops, poses.cameras, poses.T, poses.photograph
     finish = options.pop("finish", settings.finished_fits)
-    fit = on_device(fit_to_edges, *given, settings=settings, finish=finish, **options)
+    options |= {"settings": settings, "finish": finish}
+    fit = by_contours(fit_to_edges, describer, crops, poses, **options)
     return poses.with_fit(fit, describer.centre)
 
 
@@ -230,8 +246,7 @@ def with_short_fit(
 ) -> tuple[Hypotheses, Tensor]:
     """Return the poses with their short fits, and the edge supports (H,) that these reach, see
     :func:`short_fit`."""
-    given = describer.device_contours, crops, poses.cameras, poses.T, poses.photograph
-    T, support = on_device(short_fit, *given)
+    T, support = by_contours(short_fit, describer, crops, poses)
     return replace(poses, short_fit=T), support
 
 
@@ -253,9 +268,7 @@ def fit_texture_of(
 
 def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses) -> Hypotheses:
     """Poses that are not fitted, with their edge support, see :func:`contour_support`."""
-    given = describer.device_contours, crops, poses.cameras, poses.T, poses.photograph
-    support = on_device(contour_support, *given)
-    return replace(poses, edge_support=support)
+    return replace(poses, edge_support=by_contours(contour_support, describer, crops, poses))
 
 
 def common_score(hypothesis: Hypothesis, weights: EvidenceWeights) -> float:

@@ -14,7 +14,6 @@ from torch import Tensor
 from ..errors import CurviregError
 from ..evidence import Evidence, EvidenceWeights
 from ..fitting.details import ContourDetails, compared, contour_details
-from ..fitting.devices import on_device
 from ..fitting.edges import EdgeCrops
 from ..geometry.cameras import transform
 from ..geometry.framing import border_sides, outside_fraction
@@ -38,7 +37,7 @@ from .confidence import (
     shares,
     undetermined_axes,
 )
-from .hypotheses import Hypotheses, hypothesis_of, placed, with_short_fit
+from .hypotheses import Hypotheses, by_contours, hypothesis_of, placed, with_short_fit
 from .photograph import Photograph
 from .result import (
     AXIS_TOLERANCE,
@@ -348,8 +347,7 @@ def siblings_of(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     copies = best[torch.arange(len(best)).repeat_interleave(count)]
     T = copies.T @ symmetries.to(copies.T).repeat(len(best), 1, 1)
     poses = placed(copies, T, target.describer.centre)
-    given = poses.cameras, poses.T, poses.photograph
-    seen = on_device(contour_details, target.describer.device_contours, crops, *given)
+    seen = by_contours(contour_details, target.describer, crops, poses)
     poses = with_evidence(target, block, poses)
     weights = target.score_weights(exact=True)
     return [

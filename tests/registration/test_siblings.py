@@ -99,7 +99,7 @@ class Case:
         self.poses = four([0.0] * 3, [[0.0] * 3] * 3, [0, 40, 80]).poses
         different = ~torch.eye(3, dtype=torch.bool)
         monkeypatch.setattr(judging, "fitted_poses", self.fit)
-        monkeypatch.setattr(judging, "on_device", lambda *_: torch.arange(3))
+        monkeypatch.setattr(judging, "by_contours", lambda *_: torch.arange(3))
         monkeypatch.setattr(judging, "compared", lambda _: (torch.zeros(3, 3).double(), different))
         monkeypatch.setattr(
             judging,
