@@ -183,10 +183,10 @@ def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
     first = photograph(0, ranking_share=0.2, warnings=("b", "a", "own"))
     second = photograph(1, ranking_share=None, warnings=("a", "b"))
     third = photograph(2, ranking_share=0.6, warnings=("b", "x", "a"))
-    first.size = (100, 200)
-    second.size = (300, 200)
-    third.size = (100, 200)
-    second.box = torch.tensor([-0.5, 10.0, 199.5, 50.0])
+    first.photograph.size = (100, 200)
+    second.photograph.size = (300, 200)
+    third.photograph.size = (100, 200)
+    second.photograph.box = torch.tensor([-0.5, 10.0, 199.5, 50.0])
     second.printed = lambda _: 3.5
     found = {0: first, 1: second, 2: third}
     scores = SCORES | {2: [1.0, 1.0, 1.0]}
