@@ -11,7 +11,8 @@ the same from most sides; ``shelf``, several printed packages side by side, all 
 has one photograph, or one for each of --cameras, or --frames of a moving camera. --cut puts a
 fraction of the object outside the photograph. To calibrate confidence, --cad annotates an object as
 another one: similar, of its kind; wrong, any other; print, a package of the same shape with another
-print; mirrored, a tied shape's mirror image. Scene i depends only on the seed and i; an interrupted
+print; mirrored, a tied shape's mirror image; variant, the shape with one part folded, moved, left
+out, or of another size. Scene i depends only on the seed and i; an interrupted
 run can be resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette inside the picture,
 ``bbox_visib`` of its visible part. OUT/benchmark.json holds the options, and the group of each
 object for scripts/calibration.
@@ -35,6 +36,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
+from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.mesh import mesh_symmetries
 from scripts._shared import write_json
 from scripts.scenes.families import FAMILIES, random_shape
@@ -47,11 +49,12 @@ from scripts.scenes.tied import FAMILIES as TIED_FAMILIES
 from scripts.scenes.tied import tied_shape
 
 KINDS = ("printed", "shelf", "furniture", "shapes", "tied")
-CADS = ("exact", "similar", "wrong", "print", "mirrored")
+CADS = ("exact", "similar", "wrong", "print", "mirrored", "variant")
 # fraction of the surface that has the same material after a symmetry of the appearance
 SAME_LOOK = 0.97
 TWIN = 100_000  # added to the number of an object with another print, or of its mirror image
 MIN_PIXELS = 400  # of a silhouette; smaller ones are not annotated
+PART_AREA = (0.08, 0.5)  # fraction of the surface that differs in a variant
 # factor between the proportions of similar objects; if none is within it, the closest is taken
 MAX_PROPORTION = 1.6
 # symmetries about z of a body of revolution, whose azimuth is undefined: it is excluded
@@ -148,6 +151,65 @@ class Shapes(Packages):
     def similar(self, obj_id: int, rng: Rng) -> int:
         others = [k for k in self.ids if k != obj_id and self.group(k) == self.group(obj_id)]
         return int(rng.choice(others))
+
+
+class Variants(Shapes):
+    """Shapes of several parts, annotated as others of which one part differs."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        super().__init__(options)
+        self.ids = [k for k in self.ids if len(self._parts(k))]
+        self.written = [k + TWIN for k in self.ids]
+
+    @lru_cache(maxsize=100)  # noqa: B019
+    def mesh(self, obj_id: int) -> TexturedMesh:
+        mesh = super().mesh(obj_id % TWIN)
+        return self._changed(mesh, obj_id) if obj_id >= TWIN else mesh
+
+    @lru_cache(maxsize=1000)  # noqa: B019
+    def _parts(self, obj_id: int) -> list[Array]:
+        """Of each part of a shape that is neither tiny nor most of it, (F,) whether a face is of
+        it."""
+        rng = np.random.default_rng((self.seed, 3, obj_id))
+        _, _, materials = random_shape(rng, self.group(obj_id))
+        corners = super().mesh(obj_id).triangles
+        sides = corners[:, 1:] - corners[:, :1]
+        area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+        low, high = PART_AREA
+        parts = [materials == number for number in np.unique(materials)]
+        return [part for part in parts if low <= area[part].sum() / area.sum() <= high]
+
+    def _changed(self, mesh: TexturedMesh, obj_id: int) -> TexturedMesh:
+        """The mesh with one part folded by 35 to 100 degrees, moved by 0.2 to 0.5 radii, left out,
+        or 0.5 to 1.6 times as large."""
+        rng = np.random.default_rng((self.seed, 5, obj_id))
+        parts = self._parts(obj_id % TWIN)
+        part = parts[int(rng.integers(len(parts)))]
+        change = rng.choice(["folded", "moved", "left out", "another size"])
+        if change == "left out":
+            rows = {name: getattr(mesh, name)[~part] for name in ("triangles", "normals", "uv")}
+            return replace(mesh, **rows, paint=mesh.paint[~part], hull=None)
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        turn = np.eye(3)
+        shift = np.zeros(3)
+        if change == "folded":
+            turn = rotation_from_axis_angle(
+                torch.from_numpy(axis * np.radians(rng.uniform(35.0, 100.0)))
+            ).numpy()
+        elif change == "moved":
+            shift = axis * mesh.radius * rng.uniform(0.2, 0.5)
+        else:
+            turn = turn * float(rng.choice([rng.uniform(0.5, 0.75), rng.uniform(1.3, 1.6)]))
+        own = mesh.triangles[part]
+        rest = mesh.triangles[~part].reshape(-1, 3)
+        points = own.reshape(-1, 3)
+        joint = points[int(cKDTree(rest).query(points)[0].argmin())]  # where the part is attached
+        triangles = mesh.triangles.copy()
+        triangles[part] = (own - joint) @ turn.T + joint + shift
+        normals = mesh.normals.copy()
+        normals[part] = normals[part] @ turn.T
+        return replace(mesh, triangles=triangles, normals=normals, hull=None)
 
 
 class Tied(Shapes):
@@ -284,7 +346,7 @@ def compose(
         named = shown
         if options.cad == "similar":
             named = objects.similar(shown, rng)
-        elif options.cad in ("print", "mirrored"):
+        elif options.cad in ("print", "mirrored", "variant"):
             named = shown + TWIN
         elif options.cad == "wrong":
             others = [k for k in ids if objects.group(k) != objects.group(shown)]
@@ -398,7 +460,8 @@ _state: list[Any] = []
 def _start(options: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    kinds = {"furniture": Furniture, "shapes": Shapes, "tied": Tied}
+    shapes = Variants if options.cad == "variant" else Shapes
+    kinds = {"furniture": Furniture, "shapes": shapes, "tied": Tied}
     packages = Twins if options.cad == "print" else Packages
     _state[:] = [kinds.get(options.kind, packages)(options), options]
 

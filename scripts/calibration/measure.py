@@ -4,10 +4,12 @@ whether it is true: a row for each."""
 import json
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from itertools import groupby
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeAlias
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -23,7 +25,7 @@ from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis
 from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.inspection.photographs import without_colours
 from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
-from curvireg_torch.registration import Follower, judging
+from curvireg_torch.registration import Follower, camera, judging
 from curvireg_torch.registration.confidence import are_near
 from scripts.calibration.sets import ESTIMATED, GREY, MODELS, SETS, UPRIGHT, photographs_of
 
@@ -85,7 +87,8 @@ def fine(T: Tensor, sample: Row) -> bool:
 def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> Iterator[Row]:
     """One row: features, scores and errors of the hypotheses."""
     K = sample["camera_matrix"].double() if with_camera else None
-    result = registrar([sample["image"]], sample["box"][None], K)[0]
+    with recorded_gaps() as gaps:
+        result = registrar([sample["image"]], sample["box"][None], K)[0]
     if not result.ok:
         return
     seen = sample
@@ -109,11 +112,56 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
     row |= {"mirror": judging.WARNING in result.warnings}
     best = result.hypotheses[0]
     is_unique = len(S) == 1  # else the covariance is that of another pose
+    if gaps:  # logarithm of the shown focal length over the given one, and its deviation
+        row["focal gap"] = gaps[0]
+    row |= groups_of(result, registrar, seen["rotation"].double() @ R[0].T, errors_of(R, seen, S))
     if best.covariance is not None and is_unique and row["errors"][0] < RIGHT:
+        if (said := best.exactness) is not None:
+            centre = (
+                sample["rotation"].double() @ model_centre(sample) + sample["translation"].double()
+            )
+            distance = best.distance / float(centre.norm())
+            turned = said.rotation_deg if K is not None else said.allocentric_deg
+            row["errors in radii"] = [row["errors"][0] / turned]
+            row["errors in radii"] += [100.0 * abs(distance - 1.0) / said.distance_percent]
         turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
         e = torch.cat([turn, sample["translation"].double() - best.translation])
         row["distance2"] = float(e @ torch.linalg.solve(best.covariance.double(), e))
     yield row
+
+
+@contextmanager
+def recorded_gaps() -> Iterator[list[tuple[float, float]]]:
+    """By how much photographs contradict their focal lengths, with standard deviations, of the
+    registrations within."""
+    gaps = []
+    judge = camera.focal_contradiction
+
+    def recording(focal: float, gap: float, deviation: float, **more: float) -> str | None:
+        if np.isfinite(deviation):
+            gaps.append((gap, deviation))
+        return judge(focal, gap, deviation, **more)
+
+    with patch.object(camera, "focal_contradiction", recording):
+        yield gaps
+
+
+def groups_of(
+    result: cr.Registration, registrar: cr.Registrar, turn: Tensor, errors: Tensor
+) -> Row:
+    """What is said of the first two rivals of a result, and whether one of them is right; the like
+    of its axis. ``turn`` (3, 3) leads from the first hypothesis to the truth; ``errors`` (N,) in
+    degrees are those of all."""
+    row: Row = {}
+    if result.pair_probability is not None:
+        rivals = [k for k, p in enumerate(result.probabilities) if p > 0.0][:2]
+        row["pair"] = [result.pair_probability, bool((errors[rivals] < RIGHT).any())]
+    if result.axis is not None and registrar.round_axis is not None:
+        cosine = float(turn @ result.axis.direction @ result.axis.direction)
+        cosine = abs(cosine) if registrar.round_axis.ends_are_alike else cosine
+        degrees = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+        row["axis"] = [result.axis.probability, degrees <= result.axis.tolerance_deg]
+    return row
 
 
 def model_centre(sample: Row) -> Tensor:

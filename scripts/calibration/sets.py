@@ -24,6 +24,7 @@ SETS: dict[str, tuple[float, tuple[str, ...]]] = {
     "print": (0.5, (*PRINTED, "--cad", "print", "--seed", "107")),
     "mirrored": (0.2, (*TIED, "--cad", "mirrored", "--seed", "108")),
     "wrong": (0.25, (*SHAPES, "--cad", "wrong", "--seed", "109")),
+    "variant": (0.25, (*SHAPES, "--cad", "variant", "--seed", "112")),
     "furniture_similar": (1.0, (*FURNITURE, "--cad", "similar")),
     "similar": (1.0, (*SHAPES, "--cad", "similar", "--bare", "0.2", "--seed", "110")),
     "sequences": (0.1, (*SHAPES, "--frames", "30", "--seed", "111")),
@@ -46,6 +47,7 @@ SHARES = {
     "print": 0.03,
     "mirrored": 0.01,
     "wrong": 0.05,
+    "variant": 0.03,
     "estimated_wrong": 0.05,
 }
 """Assumed shares of the photographs that users have; those of the other sets have the rest, each
@@ -78,7 +80,8 @@ GREY = {
 
 MODELS = {
     "instance": (
-        *("furniture", "shapes", "packages", "shelves", "tied", "cut", "cut_packages", *ABSENT),
+        *("furniture", "shapes", "packages", "shelves", "tied", "cut", "cut_packages"),
+        *("variant", *ABSENT),
         *("estimated_shapes", "estimated_packages"),
     ),
     "category": ("furniture_similar", "similar"),

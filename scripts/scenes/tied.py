@@ -71,6 +71,22 @@ def marked(rng: Rng) -> list[Part]:
     return [(body, 0), (box(side).moved((at, 0, h + 0.5 * side)), 0)]
 
 
+def plated(rng: Rng) -> list[Part]:
+    """A plate or a disc with a flat block, 0.03 to 0.05 radii high, on one end of its top."""
+    w, d, h = rng.uniform((0.9, 0.6, 0.08), (1.2, 0.9, 0.3))
+    round_body = rng.random() < 0.3
+    body = (
+        lathe(np.full(2, 0.5 * w), np.array([0.0, h]))
+        if round_body
+        else box((w, d, h)).moved((0, 0, 0.5 * h))
+    )
+    radius = 0.5 * float(np.linalg.norm((w, w if round_body else d, h)))
+    long, wide = rng.uniform(0.12, 0.3, 2)
+    high = rng.uniform(0.03, 0.05) * radius
+    block = box((long, wide, high))
+    return [(body, 0), (block.moved((0.45 * w - 0.5 * long, 0, h + 0.5 * high)), 0)]
+
+
 def handed(rng: Rng) -> list[Part]:
     """A bracket that its mirror image does not match, such as a left part."""
     long, wide, thick = rng.uniform((0.8, 0.3, 0.08), (1.2, 0.5, 0.2))
@@ -90,7 +106,7 @@ def _without_bottom(size: tuple[float, float, float], at: tuple[float, float, fl
 
 
 FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
-    family.__name__: family for family in (holed, hollow, footed, marked, handed)
+    family.__name__: family for family in (holed, hollow, footed, marked, handed, plated)
 }
 
 

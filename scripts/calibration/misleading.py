@@ -1,0 +1,286 @@
+"""How often an answer is called reliable though its photograph, camera or mesh misleads.
+
+    python scripts/calibration/misleading.py WORK [--each 50] [--jobs 2] [--sets shapes variant]
+
+WORK is a folder of calibrate.py, whose photographs serve; finished rows in WORK/misleading.jsonl
+are kept. Each kind misleads in one or several ways:
+
+- camera: a matrix of half, two thirds or 1.6 times the size, a focal length of 0.7 or 1.3 times, a
+  photograph stretched by 1.25, a lens whose distortion is not known
+- cropped: a part of the photograph in whose middle the object is not, without a camera
+- sizes: the mesh and one 1.25 times as large, in both orders, of which one has to be chosen
+- chosen: the mesh, and one of which a part differs
+- variant: a mesh of which a part is folded, moved, left out or of another size
+- stranger: another mesh
+- twins: a nearly symmetric mesh; what tells its turns apart is small, or not in sight
+- round: a body of revolution with one hole
+
+An answer is wrong by more than 30 degrees, by more than 15 % of the distance where a camera is
+given, or if its mesh is another one: of a variant, the pose of the shared parts is right. An axis
+is wrong beyond its tolerance. "ordinary" are photographs with their own camera: of those whose
+confidence is high enough, the share that warnings cost. Writes scripts/results/misleading.json.
+"""
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+import curvireg_torch as cr
+from curvireg_torch.data import BOPDataset
+from curvireg_torch.registration.confidence import RELIABLE
+from scripts._shared import RESULTS, commit, today, write_json
+from scripts.benchmark.make import TWIN, Variants
+from scripts.calibration.measure import (
+    Row,
+    errors_of,
+    groups_of,
+    mesh_of,
+    model_centre,
+    symmetries_of,
+)
+
+ALONE = ("ordinary", "camera", "cropped", "sizes")
+SOURCES: dict[str, tuple[str, ...]] = {
+    "shapes": ALONE,
+    "packages": ALONE,
+    "furniture": ALONE,
+    "variant": ("variant", "chosen"),
+    "wrong": ("stranger",),
+    "tied": ("twins", "round"),
+}
+"""Of each set of calibrate.py: the kinds that it serves."""
+
+EVERY = {"camera": 7, "sizes": 3}
+"""Kinds for which every n-th photograph is taken, in several ways."""
+
+ROUND = "holed"  # the family of bodies of revolution among the tied ones
+OTHER_SIZES = (0.5, 2.0 / 3.0, 1.6)
+OTHER_FOCAL_LENGTHS = (0.7, 1.3)
+STRETCH = 1.25
+BARREL = (-0.3, 0.08, 0.0, 0.0)  # k1, k2, p1, p2 of OpenCV
+LARGER = 1.25
+CROPPED = 0.62  # of both sides
+WRONG_DEGREES = 30.0
+WRONG_DISTANCE = 0.15
+
+
+Case: TypeAlias = tuple[str, Tensor, Tensor, Tensor | None]
+"""A way of misleading: its name, photograph, box and camera."""
+
+
+def cases_of(kind: str, sample: Row) -> list[Case]:
+    """The ways in which a kind misleads with a photograph."""
+    image = sample["image"]
+    box = sample["box"].double()
+    K = sample["camera_matrix"].double()
+    if kind == "cropped":
+        return [cropped(image, box)]
+    if kind != "camera":
+        return [(kind, image, box, K)]
+    cases: list[Case] = []
+    for size in OTHER_SIZES:
+        wrong = torch.diag(K.new_tensor([size, size, 1.0])) @ K
+        cases.append((f"size {size:.2f}", image, box, wrong))
+    for factor in OTHER_FOCAL_LENGTHS:
+        wrong = K.clone()
+        wrong[[0, 1], [0, 1]] *= factor
+        cases.append((f"focal length {factor}", image, box, wrong))
+    return [*cases, stretched(image, box, K), distorted(image, box, K)]
+
+
+def stretched(image: Tensor, box: Tensor, K: Tensor) -> Case:
+    """Wider by ``STRETCH``, with the same focal length in both directions."""
+    H, W = image.shape[-2:]
+    wide = round(STRETCH * W)
+    picture = cv2.resize(image.permute(1, 2, 0).numpy(), (wide, H), interpolation=cv2.INTER_LINEAR)
+    sides = box.new_tensor([wide / W, 1.0, wide / W, 1.0])
+    wrong = K.clone()
+    wrong[0, 2] *= wide / W
+    return "stretched", torch.from_numpy(picture).permute(2, 0, 1), box * sides, wrong
+
+
+def distorted(image: Tensor, box: Tensor, K: Tensor) -> Case:
+    """By a lens of which the camera says nothing."""
+    H, W = image.shape[-2:]
+    camera = K.numpy()
+    lens = np.array(BARREL)
+    pixels = np.stack(np.meshgrid(np.arange(W), np.arange(H)), axis=-1).reshape(-1, 1, 2)
+    source = cv2.undistortPoints(pixels.astype(np.float64), camera, lens, P=camera)
+    source = source.reshape(H, W, 2).astype(np.float32)
+    picture = cv2.remap(
+        image.permute(1, 2, 0).numpy(),
+        source,
+        None,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    x0, y0, x1, y1 = box.tolist()
+    x, y = np.meshgrid(np.linspace(x0, x1, 21), np.linspace(y0, y1, 21))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(camera).T
+    seen = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera, lens)[0].reshape(-1, 2)
+    corners = np.concatenate([seen.min(axis=0), seen.max(axis=0)])
+    return "distorted", torch.from_numpy(picture).permute(2, 0, 1), torch.from_numpy(corners), K
+
+
+def cropped(image: Tensor, box: Tensor) -> Case:
+    """The part that holds the box and is as far from the middle of the photograph as it can be."""
+    size = torch.tensor([image.shape[-1], image.shape[-2]]).double()
+    side = torch.maximum((CROPPED * size).round(), (box[2:] - box[:2]).ceil() + 8.0)
+    middle = 0.5 * (box[:2] + box[2:])
+    rightmost = (size - side).clamp(min=0.0)
+    farthest = torch.where(middle > 0.5 * size, rightmost, 0.0)
+    corner = torch.minimum(torch.maximum(farthest, box[2:] + 4.0 - side), box[:2] - 4.0)
+    corner = torch.minimum(corner.round().clamp(min=0.0), rightmost)
+    x, y = (int(value) for value in corner)
+    wide, high = (int(value) for value in side)
+    part = image[:, y : y + high, x : x + wide].contiguous()
+    return "cropped", part, box - torch.cat([corner, corner]), None
+
+
+def answer_of(
+    result: cr.Registration, registrar: cr.Registrar, sample: Row, K: Tensor | None, right_mesh: int
+) -> Row:
+    """What a result says, and how wrong it is."""
+    S = symmetries_of(sample, registrar)
+    R = torch.stack([h.rotation.double() for h in result.hypotheses])
+    errors = errors_of(R, sample, S)
+    centre = sample["rotation"].double() @ model_centre(sample) + sample["translation"].double()
+    row: Row = {"verdict": result.verdict, "reliable": result.reliable}
+    row |= {"confidence": result.confidence, "warnings": list(result.warnings)}
+    row |= {"degrees": float(errors[0]), "mesh_is_right": result.mesh_index == right_mesh}
+    row["distance"] = float(result.distance) / float(centre.norm()) - 1.0
+    row |= groups_of(result, registrar, sample["rotation"].double() @ R[0].T, errors)
+    row["wrong"] = bool(
+        errors[0] > WRONG_DEGREES
+        or not row["mesh_is_right"]
+        or (K is not None and abs(row["distance"]) > WRONG_DISTANCE)
+    )
+    return row
+
+
+def measure(task: tuple[Path, list[str], list[int]]) -> list[Row]:
+    """Rows of the photographs of one mesh."""
+    folder, kinds, indices = task
+    torch.set_num_threads(1)
+    data = BOPDataset(folder)
+    samples = [data[i] for i in indices]
+    obj_id = int(samples[0]["obj_id"])
+    mesh = mesh_of(samples[0]["model_path"], grey=False)
+    alone = cr.Registrar(mesh)
+    rows = []
+    for kind in kinds:
+        registrars = [alone]
+        if kind in ("sizes", "chosen"):
+            # in both orders; the mesh of the photograph is the other one of a variant
+            other = mesh.copy().apply_scale(LARGER) if kind == "sizes" else original(folder, obj_id)
+            pair = [alone.bank, cr.Registrar(other).bank]
+            registrars = [cr.Registrar(pair), cr.Registrar(pair[::-1])]
+        for sample in samples:
+            for turned, registrar in enumerate(registrars):
+                shown = int(kind == "chosen") if len(registrars) > 1 else 0
+                for name, image, box, K in cases_of(kind, sample):
+                    found = registrar([image], box[None].float(), K)[0]
+                    row = {"kind": kind, "way": name, "scene": int(sample["scene_id"])}
+                    if not found.ok:
+                        rows.append({**row, "reliable": False, "error": str(found.error)})
+                        continue
+                    row |= answer_of(found, alone, sample, K, shown ^ turned)
+                    row["wrong"] = row["wrong"] or kind == "stranger"
+                    rows.append(row)
+    return rows
+
+
+def original(folder: Path, obj_id: int) -> Any:
+    """The mesh that a photograph shows, of which a variant is annotated."""
+    words = json.loads((folder / "benchmark.json").read_text())
+    options = argparse.Namespace(seed=words["seed"], models=words["models"], cad="exact")
+    shown = Variants(options).mesh(obj_id % TWIN)
+    path = folder / "models" / f"shown_{obj_id:06d}.ply"
+    shown.save_ply(path)
+    return mesh_of(path, grey=False)
+
+
+def tasks_of(work: Path, name: str, each: int) -> Iterator[tuple[Path, list[str], list[int]]]:
+    """The photographs of a set, by mesh, and the kinds that they serve; of each kind about
+    ``each``."""
+    folder = work / name
+    data = BOPDataset(folder)
+    groups = json.loads((folder / "benchmark.json").read_text())["groups"]
+    by_mesh: dict[int, list[int]] = {}
+    for i in range(len(data)):
+        by_mesh.setdefault(int(data.annotation(i)["obj_id"]), []).append(i)
+    wanted = -(-each // sum(SOURCES[name][0] in kinds for kinds in SOURCES.values()))
+    left = dict.fromkeys(SOURCES[name], wanted)
+    for number, (obj_id, indices) in enumerate(by_mesh.items()):
+        kinds = [kind for kind in SOURCES[name] if number % EVERY.get(kind, 1) == 0]
+        if name == "tied":
+            kinds = ["round" if groups[str(obj_id)] == ROUND else "twins"]
+        kinds = [kind for kind in kinds if left[kind] > 0]
+        for kind in kinds:
+            left[kind] -= len(indices)
+        if kinds:
+            yield folder, kinds, indices
+
+
+def table_of(rows: Sequence[Row]) -> Row:
+    """Counts of some rows."""
+    sure = [row for row in rows if row["reliable"]]
+    axes = [row for row in rows if row.get("verdict") == "reliable axis"]
+    confident = [row for row in rows if (row.get("confidence") or 0.0) >= RELIABLE]
+    table: Row = {"photographs": len(rows), "confident": len(confident), "reliable": len(sure)}
+    table["reliable and wrong"] = sum(row["wrong"] for row in sure)
+    table["axis reliable"] = len(axes)
+    table["axis reliable and wrong"] = sum(not row["axis"][1] for row in axes)
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--each", type=int, default=50, help="photographs of each kind")
+    parser.add_argument("--sets", nargs="+", choices=SOURCES, default=list(SOURCES))
+    parser.add_argument("--jobs", type=int, default=1)
+    options = parser.parse_args()
+    out = options.work / "misleading.jsonl"
+    done = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    known = {json.dumps(entry["task"]) for entry in done}
+    tasks = [task for name in options.sets for task in tasks_of(options.work, name, options.each)]
+    named = [[folder.name, kinds, indices] for folder, kinds, indices in tasks]
+    new = [k for k, name in enumerate(named) if json.dumps(name) not in known]
+    with (
+        ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool,
+        out.open("a") as file,
+    ):
+        found = pool.map(measure, [tasks[k] for k in new])
+        for k, rows in zip(new, tqdm(found, total=len(new), unit="mesh"), strict=True):
+            done.append({"task": named[k], "rows": rows})
+            file.write(json.dumps(done[-1]) + "\n")
+            file.flush()
+    rows = [row for entry in done for row in entry["rows"]]
+    misleading = [row for row in rows if row["kind"] != "ordinary"]
+    ways = sorted({(row["kind"], row["way"]) for row in rows})
+    record: Row = {"date": today(), "commit": commit(), "misleading": table_of(misleading)}
+    record["kinds"] = {
+        f"{kind}: {way}" if kind == "camera" else kind: table_of(
+            [row for row in rows if (row["kind"], row["way"]) == (kind, way)]
+        )
+        for kind, way in ways
+    }
+    print(json.dumps(record, indent=2))
+    write_json(RESULTS / "misleading.json", record)
+
+
+if __name__ == "__main__":
+    main()
