@@ -46,6 +46,7 @@ from scripts.calibration.measure import (
     groups_of,
     mesh_of,
     model_centre,
+    recorded_gaps,
     symmetries_of,
 )
 
@@ -60,8 +61,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
 }
 """Of each set of calibrate.py: the kinds that it serves."""
 
-EVERY = {"camera": 7, "sizes": 3}
-"""Kinds for which every n-th photograph is taken, in several ways."""
+WAYS = {"camera": 7, "sizes": 2, "chosen": 2}
+"""Kinds for which a photograph is taken in several ways."""
 
 ROUND = "holed"  # the family of bodies of revolution among the tied ones
 OTHER_SIZES = (0.5, 2.0 / 3.0, 1.6)
@@ -189,8 +190,14 @@ def measure(task: tuple[Path, list[str], list[int]]) -> list[Row]:
             for turned, registrar in enumerate(registrars):
                 shown = int(kind == "chosen") if len(registrars) > 1 else 0
                 for name, image, box, K in cases_of(kind, sample):
-                    found = registrar([image], box[None].float(), K)[0]
-                    row = {"kind": kind, "way": name, "scene": int(sample["scene_id"])}
+                    with recorded_gaps() as gaps:
+                        found = registrar([image], box[None].float(), K)[0]
+                    row = {
+                        "gap": gaps[0] if gaps else None,
+                        "kind": kind,
+                        "way": name,
+                        "scene": int(sample["scene_id"]),
+                    }
                     if not found.ok:
                         rows.append({**row, "reliable": False, "error": str(found.error)})
                         continue
@@ -222,12 +229,12 @@ def tasks_of(work: Path, name: str, each: int) -> Iterator[tuple[Path, list[str]
     wanted = -(-each // sum(SOURCES[name][0] in kinds for kinds in SOURCES.values()))
     left = dict.fromkeys(SOURCES[name], wanted)
     for number, (obj_id, indices) in enumerate(by_mesh.items()):
-        kinds = [kind for kind in SOURCES[name] if number % EVERY.get(kind, 1) == 0]
+        kinds = [kind for kind in SOURCES[name] if number % WAYS.get(kind, 1) == 0]
         if name == "tied":
             kinds = ["round" if groups[str(obj_id)] == ROUND else "twins"]
         kinds = [kind for kind in kinds if left[kind] > 0]
         for kind in kinds:
-            left[kind] -= len(indices)
+            left[kind] -= len(indices) * WAYS.get(kind, 1)
         if kinds:
             yield folder, kinds, indices
 
