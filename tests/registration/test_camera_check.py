@@ -63,14 +63,16 @@ def test_focal_lengths_of_several_photographs_are_compared_at_once(monkeypatch):
     assert float(deviations[0]) < 0.15
 
 
-def test_contradictions_need_a_clear_focal_length_and_three_deviations():
+def test_contradictions_need_a_clear_focal_length_two_deviations_and_a_distance_that_matters():
     def named(gap: float, deviation: float, given: float = 0.0) -> bool:
         return focal_contradiction(500.0, gap, deviation, given_deviation=given) is not None
 
-    assert named(0.31, 0.1)
-    assert named(-0.31, 0.1)
-    assert not named(0.29, 0.1)
+    assert named(0.21, 0.1)
+    assert named(-0.21, 0.1)
+    assert not named(0.19, 0.1)
     assert not named(0.6, 0.15), "not determined"
-    assert named(0.3, 0.05)
-    assert not named(0.3, 0.05, 0.1), "the camera is not known better"
+    assert named(0.2, 0.05)
+    assert not named(0.2, 0.05, 0.1), "the camera is not known better"
+    assert named(-0.15, 0.01)
+    assert not named(-0.13, 0.01), "a distance that is less than 15 % off"
     assert "1000 px, not the camera's 500 px" in str(focal_contradiction(500.0, 0.69315, 0.01))
