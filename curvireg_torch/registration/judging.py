@@ -392,8 +392,8 @@ def with_siblings(
 
 
 LEAST_CONFIDENCE = 0.5  # from which an answer is compared
-DOUBT = 0.3  # factor of the confidence where the mirror image fits better
-WARNING = (
+MIRROR_DOUBT = 0.3  # factor of the confidence where the mirror image fits better
+MIRROR_WARNING = (
     "the mirror image of the mesh fits better than the mesh: check whether an axis of it is flipped"
 )
 
@@ -406,7 +406,7 @@ def compared_with_mirror_image(
     results: Sequence[Registration],
 ) -> list[Registration]:
     """Results of photographs, whose ``best`` poses are one in each. Where it is probably right and
-    the mirror image of the mesh fits better, the result gets a warning, and ``DOUBT`` of its
+    the mirror image of the mesh fits better, the result gets a warning, and ``MIRROR_DOUBT`` of its
     confidence."""
     likely = torch.tensor([(result.confidence or 0.0) >= LEAST_CONFIDENCE for result in results])
     # a print that is found is not mirrored
@@ -416,8 +416,8 @@ def compared_with_mirror_image(
         return found
     gain = mirror_gain(target, block, crops, best[compared])
     for place in compared[gain > resolution(exact=True)].tolist():
-        doubted = found[place].scaled(DOUBT)
-        found[place] = replace(doubted, warnings=(*doubted.warnings, WARNING))
+        doubted = found[place].scaled(MIRROR_DOUBT)
+        found[place] = replace(doubted, warnings=(*doubted.warnings, MIRROR_WARNING))
     return found
 
 

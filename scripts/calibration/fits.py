@@ -121,7 +121,7 @@ def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
 def first_probability(row: Row, constants: Row) -> float:
     """Confidence of a row."""
     any_right = LogisticModel(constants["weights"], constants["bias"])(row["features"])
-    doubt = judging.DOUBT if row.get("mirror") else 1.0
+    doubt = judging.MIRROR_DOUBT if row.get("mirror") else 1.0
     return doubt * any_right * first_share(row, constants)
 
 

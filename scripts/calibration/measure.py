@@ -109,7 +109,7 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
     row = {"features": dict(result.confidence_features), "scores": scores[is_rival].tolist()}
     row |= {"evidence": evidence.table[is_rival].tolist()}
     row |= {"errors": errors_of(R, seen, S)[is_rival].tolist()}
-    row |= {"mirror": judging.WARNING in result.warnings}
+    row |= {"mirror": judging.MIRROR_WARNING in result.warnings}
     best = result.hypotheses[0]
     is_unique = len(S) == 1  # else the covariance is that of another pose
     if gaps:  # logarithm of the shown focal length over the given one, and its deviation

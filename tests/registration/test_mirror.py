@@ -59,7 +59,7 @@ def test_confidence_falls_where_the_mirror_image_fits_better(monkeypatch):
     for gain, is_doubted in ((-1.0, False), (0.4, False), (1.5, True)):
         monkeypatch.setattr(judging, "mirror_gain", lambda *_, gain=gain: torch.tensor([gain]))
         result = known([image], box[None], CAMERA)[0]
-        assert (judging.WARNING in result.warnings) == is_doubted
+        assert (judging.MIRROR_WARNING in result.warnings) == is_doubted
         assert result.reliable != is_doubted
         if is_doubted:
             assert result.confidence < 0.5
@@ -83,5 +83,5 @@ def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
     bank = ViewBank.build(mesh, views, image_size=96, progress=False)
     monkeypatch.setattr(judging, "LEAST_CONFIDENCE", 0.0)
     flipped = Registrar(bank)([image], box[None], CAMERA)[0]
-    assert judging.WARNING in flipped.warnings
+    assert judging.MIRROR_WARNING in flipped.warnings
     assert gains[0] < 0.0 < gains[1]
