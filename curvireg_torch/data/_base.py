@@ -5,7 +5,7 @@ import os
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
@@ -17,6 +17,16 @@ from .images import read_image
 
 Sample = dict[str, Any]
 JointTransform = Callable[[Any, Sample], tuple[Any, Sample]]
+
+
+class Transforms(TypedDict, total=False):
+    """Functions of :class:`ObjectDataset`, which its subclasses take as well."""
+
+    transform: Callable[[Tensor], Any] | None
+    target_transform: Callable[[Sample], Sample] | None
+    transforms: JointTransform | None
+
+
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".JPEG", ".JPG", ".PNG", ".tif", ".tiff")
 
 

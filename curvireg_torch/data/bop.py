@@ -2,12 +2,11 @@
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import torch
-from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
 from ..formats.cameras.record import flattened
@@ -16,9 +15,9 @@ from ..utils.checks import check_camera_matrix, check_rotation
 from ..utils.files import finite_numbers, read_json
 from ._base import (
     IMAGE_SUFFIXES,
-    JointTransform,
     ObjectDataset,
     Sample,
+    Transforms,
     existing_root,
     is_plain_name,
 )
@@ -79,16 +78,9 @@ class BOPDataset(ObjectDataset):
         *,
         targets: bool | None = None,
         models: str = "models",
-        transform: Callable[[Tensor], Any] | None = None,
-        target_transform: Callable[[Sample], Sample] | None = None,
-        transforms: JointTransform | None = None,
+        **functions: Unpack[Transforms],
     ) -> None:
-        super().__init__(
-            existing_root(root, _README),
-            transform=transform,
-            target_transform=target_transform,
-            transforms=transforms,
-        )
+        super().__init__(existing_root(root, _README), **functions)
         self.split = split
         scenes = self.root / split
         if not is_plain_name(split) or not scenes.is_dir():

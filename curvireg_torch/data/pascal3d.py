@@ -3,20 +3,19 @@ ImageNet."""
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 import numpy as np
-from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.checks import check_option
 from ._base import (
     IMAGE_SUFFIXES,
-    JointTransform,
     ObjectDataset,
     Sample,
+    Transforms,
     existing_root,
     is_plain_name,
     pose_fields,
@@ -84,16 +83,9 @@ class Pascal3DPlus(ObjectDataset):
         truncated: bool = True,
         difficult: bool = True,
         pixel_origin: int = 1,
-        transform: Callable[[Tensor], Any] | None = None,
-        target_transform: Callable[[Sample], Sample] | None = None,
-        transforms: JointTransform | None = None,
+        **functions: Unpack[Transforms],
     ) -> None:
-        super().__init__(
-            existing_root(root, _README),
-            transform=transform,
-            target_transform=target_transform,
-            transforms=transforms,
-        )
+        super().__init__(existing_root(root, _README), **functions)
         check_option(part, ("pascal", "imagenet"), "part")
         if pixel_origin not in (0, 1):
             raise InvalidInputError(f"pixel_origin: expected 0 or 1, got {pixel_origin}")

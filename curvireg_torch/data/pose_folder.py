@@ -2,16 +2,13 @@
 
 import math
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
-
-from torch import Tensor
+from typing import Unpack
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.choices import MESHES
 from ..utils.files import read_csv
-from ._base import JointTransform, ObjectDataset, Sample, existing_root, is_plain_name, pose_fields
+from ._base import ObjectDataset, Sample, Transforms, existing_root, is_plain_name, pose_fields
 
 _README = "datasets/web/README.md"
 _COLUMNS = ["image", "x0", "y0", "x1", "y1", "azimuth", "elevation", "theta", "distance"]
@@ -53,17 +50,9 @@ class PoseFolder(ObjectDataset):
     def __init__(
         self,
         root: str | os.PathLike[str],
-        *,
-        transform: Callable[[Tensor], Any] | None = None,
-        target_transform: Callable[[Sample], Sample] | None = None,
-        transforms: JointTransform | None = None,
+        **functions: Unpack[Transforms],
     ) -> None:
-        super().__init__(
-            existing_root(root, _README),
-            transform=transform,
-            target_transform=target_transform,
-            transforms=transforms,
-        )
+        super().__init__(existing_root(root, _README), **functions)
         folders = sorted(
             p for p in self.root.iterdir() if p.is_dir() and not p.name.startswith(".")
         )

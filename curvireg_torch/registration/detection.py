@@ -195,19 +195,14 @@ class Candidate:
     def register(self, target: Target, item: Photograph) -> "Found":
         (result,) = register(target, [replace(item, box=self.box.float())], self.query)
         box = projected_box(target.describer, result.projection)
-        return Found(result, box, self.response, self.rival, self.score)
+        return Found(**{**vars(self), "box": box}, registration=result)
 
 
-@dataclass(frozen=True)
-class Found:
-    """A registration, the ``box`` (4,) around its pose, and what is known of the box that led to
-    it."""
+@dataclass(frozen=True, kw_only=True)
+class Found(Candidate):
+    """A registered candidate, with the ``box`` (4,) around its pose."""
 
     registration: Registration
-    box: Tensor
-    response: float
-    rival: float | None
-    score: float
 
     @property
     def probability(self) -> float:

@@ -174,9 +174,8 @@ def test_the_most_certain_of_all_proposals_is_reported(registrar, found, monkeyp
 
 def as_found(result, **changes):
     where = result.detection
-    return replace(
-        detection_module.Found(result, where.box, where.response, None, where.score), **changes
-    )
+    known = where.box, where.response, None, None, where.score
+    return replace(Found(*known, registration=result), **changes)
 
 
 def test_probabilities_are_those_of_a_right_box_times_its_score(found):
@@ -363,7 +362,8 @@ def test_medoids_are_the_centres_of_clusters():
 @pytest.mark.parametrize(("score", "kept"), [(0.2, [0.9, 0.3]), (0.5, [0.9, 0.3]), (0.95, [0.95])])
 def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_each(score, kept):
     def at(x0, score):
-        return Found(None, torch.tensor([x0, 0.0, x0 + 10.0, 10.0]), 1.0, None, score)
+        box = torch.tensor([x0, 0.0, x0 + 10.0, 10.0])
+        return Found(box, 1.0, None, None, score, registration=None)
 
     found = [at(0.0, 0.9), at(5.0, 0.3)]
     _add(found, at(2.0, score))
