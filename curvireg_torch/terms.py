@@ -434,7 +434,7 @@ class Repeatability(Term):
         # cells)
         cells = (-(-S // cell)) ** 2
         device = views.descriptors.device
-        near = torch.empty(cells, len(views), dtype=count_dtype(cell), device=device)
+        near = torch.empty(cells, len(views), dtype=_count_dtype(cell), device=device)
 
         def count(start: int) -> None:
             some = slice(start, start + VIEWS_AT_A_TIME)
@@ -485,7 +485,7 @@ def dilate_points(points: Tensor, eps: float) -> Tensor:
     return torch.from_numpy(dilated[:, :-radius].view(bool)).to(points.device)
 
 
-def count_dtype(cell: int) -> torch.dtype:
+def _count_dtype(cell: int) -> torch.dtype:
     """The integers of :func:`cell_counts`: of 8 bits if that suffices for a cell, else of 16."""
     return torch.uint8 if cell**2 < 256 else torch.int16
 
@@ -494,7 +494,7 @@ def cell_counts(points: Tensor, cell: int) -> Tensor:
     """(N, C, C) number of set pixels of (N, S, S) bool in cells of ``cell`` px, the last of which
     may be cut."""
     over = -points.shape[-1] % cell
-    count = F.pad(points.view(torch.uint8), (0, over, 0, over)).to(count_dtype(cell))
+    count = F.pad(points.view(torch.uint8), (0, over, 0, over)).to(_count_dtype(cell))
     for dim in (1, 2):  # rows first: they are contiguous
         count = functools.reduce(torch.add, count.unfold(dim, cell, cell).unbind(dim=3))
     return count

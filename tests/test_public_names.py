@@ -1,7 +1,8 @@
-"""What packages export: no name is public by accident."""
+"""What packages and modules export: no name is public by accident."""
 
 import ast
 import importlib
+import re
 from pathlib import Path
 
 import pytest
@@ -57,3 +58,39 @@ def test_names_of_packages_are_those_that_they_export():
                 if not (beside.is_dir() or beside.with_suffix(".py").exists()):
                     wrong.append(f"{path.relative_to(ROOT)}: {source}.{name}")
     assert wrong == []
+
+
+def test_private_names_stay_in_their_modules():
+    wrong = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        pairs = imported(tree, dotted(path), is_package=path.name == "__init__.py")
+        wrong += [
+            f"{path.relative_to(ROOT)}: {source}.{name}"
+            for source, name in pairs
+            if source.startswith("curvireg_torch") and re.match("_[^_]", name)
+        ]
+    assert wrong == []
+
+
+def test_public_functions_are_used_outside_their_modules():
+    folders = [ROOT / name for name in ("curvireg_torch", "tests", "scripts", "docs")]
+    sources = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
+    texts = {
+        path: path.read_text(encoding="utf-8")
+        for path in sources
+        if path.suffix in (".py", ".pyi", ".md")
+    }
+    files_of: dict[str, set[Path]] = {}
+    for path, text in texts.items():
+        for word in set(re.findall(r"\w+", text)):
+            files_of.setdefault(word, set()).add(path)
+    wrong = [
+        f"{path.relative_to(ROOT)}: {node.name}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for node in ast.parse(texts[path]).body
+        if isinstance(node, ast.FunctionDef)
+        and not node.name.startswith("_")
+        and files_of[node.name] == {path}
+    ]
+    assert wrong == [], "used in one module alone: begin their names with an underscore"

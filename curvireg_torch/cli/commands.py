@@ -46,14 +46,14 @@ PROTOCOL = (
 FORMATS = (".png", ".svg", ".pdf")
 
 
-def add_bank(commands: Any) -> None:
+def _add_bank(commands: Any) -> None:
     parser = add_command(
         commands,
         "bank",
         "curvireg bank part.stl --unit mm --out part.safetensors",
         "curvireg bank chair.glb --pose upright --out chair.safetensors",
         help="render and describe the views of MESH",
-        run=build_bank,
+        run=_build_bank,
     )
     parser.add_argument("mesh", type=Path, metavar="MESH")
     parser.add_argument(
@@ -62,7 +62,7 @@ def add_bank(commands: Any) -> None:
     add_options(parser, *MESH, *METHOD)
 
 
-def build_bank(arguments: argparse.Namespace) -> None:
+def _build_bank(arguments: argparse.Namespace) -> None:
     """Build and save a bank."""
     check_given([], [arguments.mesh])
     if arguments.out.suffix != ".safetensors" or arguments.out.is_dir():
@@ -93,7 +93,7 @@ def build_bank(arguments: argparse.Namespace) -> None:
     print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")
 
 
-def add_cache(commands: Any) -> None:
+def _add_cache(commands: Any) -> None:
     text = "list or clear the banks cached on disk"
     examples = ("curvireg cache list", "curvireg cache clear")
     parser = add_command(commands, "cache", *examples, help=text, run=show_cache)
@@ -131,7 +131,7 @@ def _mesh_of(bank: Path) -> str:
         return "damaged"
 
 
-def add_evaluate(commands: Any) -> None:
+def _add_evaluate(commands: Any) -> None:
     example = "curvireg evaluate bop data/bop/lm --out out/lm"
     datasets = add_command(
         commands, "evaluate", example, help="register and score a dataset"
@@ -146,7 +146,7 @@ def add_evaluate(commands: Any) -> None:
             help=kind.help,
             description="Writes DIR/summary.json, DIR/predictions.csv and DIR/index.html; the "
             "same command resumes.",
-            run=run_evaluation,
+            run=_run_evaluation,
         )
         dataset.set_defaults(dataset=name)
         kind.add_arguments(dataset)
@@ -170,7 +170,7 @@ def add_evaluate(commands: Any) -> None:
         )
 
 
-def run_evaluation(arguments: argparse.Namespace) -> None:
+def _run_evaluation(arguments: argparse.Namespace) -> None:
     """Evaluate a dataset and print the headline."""
     if not Path(arguments.root).is_dir():
         raise MissingFileError(
@@ -215,7 +215,7 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
     print(f"protocol: {summary['protocol']}; see {arguments.out}/summary.json")
 
 
-def add_view(commands: Any) -> None:
+def _add_view(commands: Any) -> None:
     parser = add_command(
         commands,
         "view",
@@ -262,7 +262,7 @@ def view(arguments: argparse.Namespace) -> None:
         serve(options, host=arguments.host, port=arguments.port, browser=arguments.browser)
 
 
-def add_plot(commands: Any) -> None:
+def _add_plot(commands: Any) -> None:
     examples = [
         f"curvireg plot {kind} photo.jpg part.stl --box 410 220 890 700 --out {kind}.png"
         for kind in PICTURES
@@ -320,7 +320,7 @@ def draw(arguments: argparse.Namespace) -> None:
     print(arguments.out)
 
 
-def add_demo(commands: Any) -> None:
+def _add_demo(commands: Any) -> None:
     examples = (
         "curvireg demo --out out/demo",
         "curvireg demo --seed 7 --preset fast --out out/demo",
@@ -378,4 +378,4 @@ def demo(arguments: argparse.Namespace) -> None:
     )
 
 
-COMMANDS = (add_bank, add_cache, add_evaluate, add_view, add_plot, add_demo)
+COMMANDS = (_add_bank, _add_cache, _add_evaluate, _add_view, _add_plot, _add_demo)

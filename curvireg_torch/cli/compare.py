@@ -18,14 +18,14 @@ def add_compare(commands: Any) -> None:
         "worse,\n"
         "the p of a sign test, and a Markdown and a LaTeX row of each run. Objects in one run "
         "only do not count.",
-        run=compare_runs,
+        run=_compare_runs,
     )
     parser.add_argument("a", type=Path, metavar="RUN_A", help="folder of 'curvireg evaluate --out'")
     parser.add_argument("b", type=Path, metavar="RUN_B", help="another one, of the same dataset")
     parser.add_argument("--json", action="store_true", help="print the comparison as JSON")
 
 
-def compare_runs(arguments: argparse.Namespace) -> None:
+def _compare_runs(arguments: argparse.Namespace) -> None:
     """Compare two evaluations."""
     from ..evaluation.compare import compare, in_words, read_run, to_document
 

@@ -31,7 +31,7 @@ def add_inspect(commands: Any) -> None:
         "right answers",
         description="Writes DIR/inspect.json and DIR/inspect.html, from generated photographs of "
         "the mesh.",
-        run=run_inspect,
+        run=_run_inspect,
     )
     parser.add_argument("mesh", type=Path, metavar="MESH")
     parser.add_argument(
@@ -95,7 +95,7 @@ class StageBars:
         self._bar.update(done - self._bar.n)
 
 
-def run_inspect(arguments: argparse.Namespace) -> int:
+def _run_inspect(arguments: argparse.Namespace) -> int:
     """Write the report and print it."""
     check_given([], [arguments.mesh])
     if arguments.mesh.suffix == ".safetensors":

@@ -149,7 +149,7 @@ class BOPDataset(ObjectDataset):
             except InvalidInputError:
                 return self._skip("corrupt_annotation", f"{scene}/{name}")
         ground_truth, cameras, infos = contents
-        images = images_by_number(folder)
+        images = _images_by_number(folder)
         for key in sorted(ground_truth, key=lambda k: int(k) if k.isdecimal() else -1):
             item = f"{scene}/{key}"
             instances = ground_truth[key]
@@ -269,7 +269,7 @@ def _check_sensors(scenes: Path, numbered: Sequence[Path]) -> None:
         raise InvalidInputError(message, subject=scenes)
 
 
-def images_by_number(scene: Path) -> dict[int, Path]:
+def _images_by_number(scene: Path) -> dict[int, Path]:
     """The pictures of a scene by their numbers, whatever zeros are in front; ``rgb`` takes
     precedence over ``gray``."""
     found = {}

@@ -129,14 +129,14 @@ class Pascal3DBenchmark(Benchmark):
         easy_scores = {name: self.scores(rows, errors, classes[name]) for name in sorted(classes)}
         summary["subsets"]["easy"] |= {
             "per_class": easy_scores,
-            "mean_over_classes": mean_scores(easy_scores),
+            "mean_over_classes": _mean_scores(easy_scores),
         }
-        summary["mean_over_classes"] = mean_scores(summary["per_class"])
+        summary["mean_over_classes"] = _mean_scores(summary["per_class"])
         summary["symmetries"] = {name: text for name, (text, _) in SYMMETRIES.items()}
         return summary
 
 
-def mean_scores(groups: Mapping[str, Row]) -> Row:
+def _mean_scores(groups: Mapping[str, Row]) -> Row:
     """Plain means of the scores of some groups, which may hold scores themselves, and
     ``n_classes``, their number.
 
@@ -148,7 +148,7 @@ def mean_scores(groups: Mapping[str, Row]) -> Row:
     means: Row = {"n_classes": len(rows)}
     for name, value in rows[0].items():
         if isinstance(value, dict):
-            means[name] = mean_scores({group: row[name] for group, row in groups.items()})
+            means[name] = _mean_scores({group: row[name] for group, row in groups.items()})
             del means[name]["n_classes"]
         elif name != "n":
             means[name] = sum(row[name] for row in rows) / len(rows)

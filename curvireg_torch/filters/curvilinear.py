@@ -25,7 +25,7 @@ BACKGROUND_DEPTH = 1.25
 MIN_RELATIVE_RANGE = 1e-6
 
 
-def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Depth with missing pixels at the largest number; nearest depth and depth range of each image,
     (B, 1, 1, 1). Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of
     rounding, which must not be stretched, the largest depth is returned instead. The range of an
@@ -72,7 +72,7 @@ def apply_to_depth(
         mask = mask.expand(depth.shape)
 
     def on_surface(depth: Tensor, mask: Tensor | None, *cameras: Tensor) -> ops.Planes:
-        surface, near, span = visible_range(depth, mask)
+        surface, near, span = _visible_range(depth, mask)
         if cameras:
             z = torch.minimum(surface, near + BACKGROUND_DEPTH * span) / span
         else:

@@ -58,7 +58,7 @@ def anisotropic_diffusion(
 
     def layer(x: Tensor) -> ops.Planes:
         filled = ops.fill_missing(x)
-        warn_of_unit(filled, kappa)
+        _warn_of_unit(filled, kappa)
         return (diffuse(filled, iterations, kappa, step, conductance),)
 
     return ops.apply_in_blocks(layer, ops.at_least_float32(image)).to(image.dtype)
@@ -67,7 +67,7 @@ def anisotropic_diffusion(
 LARGEST_KAPPA = 0.2  # that is meant for images in [0, 1]
 
 
-def warn_of_unit(image: Tensor, kappa: float | Tensor) -> None:
+def _warn_of_unit(image: Tensor, kappa: float | Tensor) -> None:
     """Warn of grey levels in another unit than kappa's, where it can be read."""
     if isinstance(kappa, Tensor) and not ops.is_host_readable(kappa):
         return
@@ -135,7 +135,7 @@ def multiscale_curvilinear_saliency(
     contrast = ops.check_scalar(kappa, "kappa")
 
     def layer(image: Tensor) -> ops.Planes:
-        warn_of_unit(image, contrast)
+        _warn_of_unit(image, contrast)
         level = image
         field, saliency = _normalised_saliency(level, checked_sigma)
         lowest = saliency

@@ -279,7 +279,7 @@ def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = 
     readable = not isinstance(sigma, Tensor) or is_host_readable(sigma)
     if linear or prefers_shifts(x, sigma) or not readable:
         weights = _gaussian_kernel(sigma, x)
-        pad = extrapolate_pad if linear else replicate_pad
+        pad = _extrapolate_pad if linear else replicate_pad
         return _weighted_shifts(pad(x, len(weights) // 2 + margin), weights)
     from kornia.filters import gaussian_blur2d  # here, because its import takes 0.3 s
 
@@ -352,7 +352,7 @@ def replicate_pad(x: Tensor, radius: int) -> Tensor:
     return F.pad(x, (radius, radius, radius, radius), mode="replicate") if radius else x
 
 
-def extrapolate_pad(x: Tensor, radius: int) -> Tensor:
+def _extrapolate_pad(x: Tensor, radius: int) -> Tensor:
     """Pad (B, C, H, W) by ``radius`` px on all sides with the slope at the border, so that planes
     stay planes."""
     steps = torch.arange(1, radius + 1, device=x.device, dtype=x.dtype)

@@ -93,7 +93,7 @@ def _pose_of(content: Any, name: str, mesh: str) -> PoseRecord:
         return reader(content)
     matrices = [flattened(content[key]) for name, key in keys.items() if name in _MATRICES]
     if numbers := next((values for values in matrices if len(values) in (12, 16)), None):
-        return PoseRecord(pose_matrix(numbers), None, _confidence(content))
+        return PoseRecord(_pose_matrix(numbers), None, _confidence(content))
     return _rotation_and_translation(content)
 
 
@@ -151,7 +151,7 @@ def _item(items: Sequence[Any], name: str, mesh: str) -> Any:
     return chosen[0]
 
 
-def pose_matrix(numbers: Sequence[Any]) -> NDArray[np.float64]:
+def _pose_matrix(numbers: Sequence[Any]) -> NDArray[np.float64]:
     """(4, 4) of 12 or 16 numbers row by row; or of 16 column by column, which have 0 0 0 1 in the
     last column and the translation in the last row."""
     last = [0.0, 0.0, 0.0, 1.0]

@@ -15,7 +15,7 @@ BORDER = 1.5  # Pixels from the border within which a side of a box lies on it
 EXTENSIONS = (0.4, 1.2)
 
 
-def photograph_box(size: tuple[int, int]) -> Tensor:
+def _photograph_box(size: tuple[int, int]) -> Tensor:
     """(4,) float64 box of a photograph of ``size`` (H, W)."""
     height, width = size
     return torch.tensor([-0.5, -0.5, width - 0.5, height - 0.5], dtype=torch.float64)
@@ -23,7 +23,7 @@ def photograph_box(size: tuple[int, int]) -> Tensor:
 
 def clipped(box: Tensor, size: tuple[int, int]) -> Tensor:
     """The part of a box (4,) inside a photograph of ``size`` (H, W), which it overlaps."""
-    limits = photograph_box(size).to(box)
+    limits = _photograph_box(size).to(box)
     low = torch.maximum(box[:2], limits[:2])
     high = torch.minimum(box[2:], limits[2:])
     return torch.cat([low, high])
@@ -44,7 +44,7 @@ def border_sides(box: Tensor, size: tuple[int, int]) -> int:
 def _on_border(box: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Which of the sides x0, y0 and of the sides x1, y1 of a box (4,) lie on the border of a
     photograph of ``size`` (H, W), or beyond it, each (2,) bool."""
-    limits = photograph_box(size).to(box)
+    limits = _photograph_box(size).to(box)
     return box[:2] <= limits[:2] + BORDER, box[2:] >= limits[2:] - BORDER
 
 
@@ -92,7 +92,7 @@ class CropFrame:
         pixels = torch.arange(side, dtype=torch.float64)
         x = to_photograph[0, 0] * pixels + to_photograph[0, 2]
         y = to_photograph[1, 1] * pixels + to_photograph[1, 2]
-        x0, y0, x1, y1 = photograph_box(size)
+        x0, y0, x1, y1 = _photograph_box(size)
         inside = ((y >= y0) & (y <= y1))[:, None] & ((x >= x0) & (x <= x1))
         return cls(crop_transforms(square, side), inside[None])
 
@@ -117,7 +117,7 @@ def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) 
     if float(depth.min()) <= 0.0:
         return 1.0
     pixels = project_points(hull.to(T), T[None], K[None])[0].numpy()
-    x0, y0, x1, y1 = photograph_box(size).tolist()
+    x0, y0, x1, y1 = _photograph_box(size).tolist()
     # In units of the photograph's longer side: OpenCV computes in single precision.
     scale = 1.0 / max(size)
     outline = cv2.convexHull((scale * pixels).astype(np.float32))

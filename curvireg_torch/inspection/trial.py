@@ -255,7 +255,7 @@ class _Setup:
         """The outcome of a registration; without a camera, rotations are compared as a camera that
         looks at the object sees them."""
         truth = photograph.truth[:3, :3]
-        elevation = float(viewpoint_of(self.mesh, truth)[1])
+        elevation = float(_viewpoint_of(self.mesh, truth)[1])
         if result is None:
             return Outcome(photograph, None, 180.0, elevation)
         rotation = result.rotation
@@ -313,7 +313,7 @@ def _like(registrar: Registrar, mesh: trimesh.Trimesh, report: Report) -> Regist
     return Registrar(other, mesh_is="exact")
 
 
-def viewpoint_of(mesh: trimesh.Trimesh, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _viewpoint_of(mesh: trimesh.Trimesh, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Azimuth, elevation and theta of rotations (..., 3, 3) from the mesh's axes, z up."""
     return viewpoint_from_rotation(rotation @ up_rotation(mesh_up(mesh)).double().mT)
 

@@ -149,7 +149,8 @@ def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]
         if is_video(path):
             common = entry_of(path, options)
             entries += [
-                replace(common, name=name, frame=frame) for name, frame in video_frames(path, every)
+                replace(common, name=name, frame=frame)
+                for name, frame in _video_frames(path, every)
             ]
         else:
             entries += [_entry_of(photo, options) for photo in find_photographs(path)]
@@ -171,7 +172,7 @@ def is_video(path: Path) -> bool:
     return path.suffix.lower() in VIDEOS and path.is_file()
 
 
-def video_frames(path: Path, every: int) -> Iterator[tuple[str, VideoFrame]]:
+def _video_frames(path: Path, every: int) -> Iterator[tuple[str, VideoFrame]]:
     """Name of ``every`` n-th frame of a video, and the frame, which is read later."""
     reader = FrameReader(path, every=every)
     for number in Video(path, every=every).numbers():

@@ -103,7 +103,7 @@ def whole_number(low: int, high: int | None = None) -> Callable[[str], int]:
     return read
 
 
-def camera_option(text: str) -> Any:
+def _camera_option(text: str) -> Any:
     """Return fx, fy, cx, cy, "exif", or the name of a calibration file."""
     if not re.fullmatch(r"[-+.\deE,\s]+", text):
         return "exif" if text.lower() == "exif" else text
@@ -174,7 +174,7 @@ class RegisterOptions:
         "distortion is removed. exif insists on the focal length of the photograph's file "
         "(default: this one, if it "
         "has one; else the focal length is estimated, and the distance with it)",
-        type=camera_option,
+        type=_camera_option,
     )
     mask: Path | None = _option(
         None,

@@ -130,7 +130,7 @@ def run_entries(
                 digests = {"request": task.request, "photo": ""}
                 finished = Finished({"digests": digests, **failed_row(finished)}, None)
             if finished.picture is not None:
-                write_file(thumbnail_path(out, finished.row["digests"]), finished.picture)
+                write_file(_thumbnail_path(out, finished.row["digests"]), finished.picture)
             store.append({"key": task.entry.key, **finished.row})
             bar.update()
     return store
@@ -257,11 +257,11 @@ def failed_row(error: Exception | str, **values: Any) -> Row:
     return {"schema": SCHEMA, "verdict": verdict, "message": message, **values}
 
 
-def thumbnail_path(out: Path, digests: Mapping[str, str]) -> Path:
+def _thumbnail_path(out: Path, digests: Mapping[str, str]) -> Path:
     """Where the picture of a result in the folder ``out`` is."""
     return out / "thumbnails" / f"{digests['request']}.jpg"
 
 
 def thumbnail_of(out: Path, row: Row) -> Path | None:
     """The picture of a row; None if it has no pose."""
-    return thumbnail_path(out, row["digests"]) if has_pose(row) else None
+    return _thumbnail_path(out, row["digests"]) if has_pose(row) else None

@@ -79,7 +79,7 @@ class Detector(nn.Module):
         networks = (module for module in matcher.modules() if isinstance(module, Backbone))
         self.backbone = (next(networks, None) or Backbone()).to(matcher.bank.device)
         bank = matcher.bank
-        self._views = representative_views(bank, self.settings.views)
+        self._views = _representative_views(bank, self.settings.views)
         boxes = bank.boxes[self._views].double()
         away = bank.distances[self._views]
         A = crop_transforms(square_boxes(boxes, bank.settings.margin), TEMPLATE_SIDE)
@@ -253,7 +253,7 @@ class Detector(nn.Module):
         return Proposals(box[kept].cpu(), response[kept].cpu(), view[kept.cpu()])
 
 
-def representative_views(bank: ViewBank, count: int) -> Tensor:
+def _representative_views(bank: ViewBank, count: int) -> Tensor:
     """(K,) k-medoids of a bank's views, ascending, on the CPU; all of a bank that has no more than
     ``count``. The distance of two views is the squared distance of their unit descriptors plus that
     of the logarithms of their boxes' aspect ratios. The first medoid is the most central view, each

@@ -243,11 +243,11 @@ def _appearance(
 
 def counting_keypoints(target: Target, described: Described, poses: Hypotheses) -> Tensor:
     """(N,) number of keypoints that agree with poses, beyond those that agree by chance."""
-    count = agreeing_keypoints(described, poses)
+    count = _agreeing_keypoints(described, poses)
     return (count - target.pipeline.fit.chance_keypoints).clamp(min=0.0)
 
 
-def agreeing_keypoints(described: Described, poses: Hypotheses) -> Tensor:
+def _agreeing_keypoints(described: Described, poses: Hypotheses) -> Tensor:
     """(N,) float64 number of keypoints that agree with poses."""
     count = torch.zeros(len(poses), dtype=torch.float64)
     for photograph, keypoints in enumerate(described.keypoints):
@@ -395,8 +395,8 @@ def fitted_poses(
     poses = fit_poses(target.describer, crops, starts, settings=settings, **options)
     if all(keypoints is None for keypoints in block.keypoints):
         return poses
-    before = agreeing_keypoints(block, starts)
-    after = agreeing_keypoints(block, poses)
+    before = _agreeing_keypoints(block, starts)
+    after = _agreeing_keypoints(block, poses)
     is_left = (before >= settings.min_keypoints) & (after < settings.kept_keypoints * before)
     left = is_left.nonzero()[:, 0]
     if not len(left):

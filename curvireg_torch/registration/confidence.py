@@ -71,7 +71,7 @@ class LogisticModel:
         )
 
 
-def model_name(*, exact: bool) -> str:
+def _model_name(*, exact: bool) -> str:
     """Which model serves: "instance" for the mesh of this very object and a known camera, else
     "category"."""
     return "instance" if exact else "category"
@@ -101,7 +101,7 @@ def is_calibrated(pipeline: Pipeline) -> bool:
 def probability_of_any(features: Features, *, exact: bool) -> float:
     """Probability that one of the hypotheses is within 30 degrees of the truth, from
     :func:`confidence_features`."""
-    return LogisticModel.named(model_name(exact=exact))(features)
+    return LogisticModel.named(_model_name(exact=exact))(features)
 
 
 def refinement_confidence(features: Features) -> float:
@@ -238,7 +238,7 @@ def confidence_features(
 def resolution(*, exact: bool) -> float:
     """Difference of two scores up to which a photograph does not tell which of two poses is
     right."""
-    return float(CALIBRATION[model_name(exact=exact)]["resolution"])
+    return float(CALIBRATION[_model_name(exact=exact)]["resolution"])
 
 
 def shares(scores: Tensor, *, exact: bool) -> Tensor:
@@ -251,14 +251,14 @@ def shares(scores: Tensor, *, exact: bool) -> Tensor:
 
     Args:
         scores: by which hypotheses are ordered.
-        exact: see :func:`model_name`.
+        exact: see :func:`_model_name`.
 
     Example:
         >>> import torch
         >>> shares(torch.tensor([3.0, 3.0]), exact=True).tolist()
         [0.5, 0.5]
     """
-    constants = CALIBRATION[model_name(exact=exact)]
+    constants = CALIBRATION[_model_name(exact=exact)]
     behind = scores.double().max() - scores.double() - constants["resolution"]
     logits: Tensor = -constants["slope"] * behind.clamp(min=0.0)
     return logits.softmax(dim=0)

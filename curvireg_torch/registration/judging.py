@@ -339,7 +339,9 @@ class Siblings:
         return rival, bool(alike.any())
 
 
-def siblings_of(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses) -> list[Siblings]:
+def _siblings_of(
+    target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
+) -> list[Siblings]:
     """The siblings of the ``best`` pose of each photograph, by the symmetries of the shape that
     small features tell apart, the identity first."""
     symmetries = target.telling_symmetries.transforms
@@ -366,7 +368,7 @@ def with_siblings(
     if len(symmetries) == 1:
         return poses, poses[:0], [False] * len(block)
     best = poses.best(target.score_weights(exact=True))
-    siblings = siblings_of(target, block, crops, poses[best])
+    siblings = _siblings_of(target, block, crops, poses[best])
     kept = [one.best() for one in siblings]
     moved = torch.tensor([k for k, place in enumerate(kept) if place], dtype=torch.long)
     if len(moved):

@@ -223,7 +223,7 @@ class Registrar(Target):
         :meta private:
         """
         if self.workers is not None and len(items) > 1:
-            return register_by_workers(self, self.workers, items, detects=detects)
+            return _register_by_workers(self, self.workers, items, detects=detects)
         if not detects:
             return register_photographs(self, items, self.others)
 
@@ -279,7 +279,7 @@ class Registrar(Target):
         return result
 
 
-def register_by_workers(
+def _register_by_workers(
     registrar: Registrar,
     workers: Workers,
     items: Sequence[Photograph | CurviregError],

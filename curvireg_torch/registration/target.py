@@ -196,7 +196,7 @@ class Target:
     @cached_property
     def mesh_warnings(self) -> tuple[str, ...]:
         """What makes every pose of this mesh questionable, in words."""
-        return flat_mesh_warnings(self.bank.mesh)
+        return _flat_mesh_warnings(self.bank.mesh)
 
     @property
     def mesh_notes(self) -> tuple[str, ...]:
@@ -284,7 +284,7 @@ def nearest_view(target: Target, rotation: Tensor) -> int:
     return int((R.flatten(1) @ rotation.flatten().to(R)).argmax())
 
 
-def flat_mesh_warnings(mesh: trimesh.Trimesh) -> tuple[str, ...]:
+def _flat_mesh_warnings(mesh: trimesh.Trimesh) -> tuple[str, ...]:
     """What makes every pose of a flat mesh questionable, in words."""
     vertices = torch.from_numpy(mesh.vertices.copy()).double()
     thickness = (

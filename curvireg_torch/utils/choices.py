@@ -87,7 +87,7 @@ UP_AXES = {
 _ORDER = "the photograph comes first, the mesh last"
 
 
-def is_pattern(path: Path) -> bool:
+def _is_pattern(path: Path) -> bool:
     """Whether a path is a pattern of several, such as ``shots/*.jpg``."""
     return bool(pattern_of(path))
 
@@ -110,7 +110,7 @@ def pattern_of(path: Path) -> str:
 def is_one_photograph(paths: Sequence[Path]) -> bool:
     """Whether the paths are a single file that is not a video."""
     return len(paths) == 1 and not (
-        is_pattern(paths[0]) or paths[0].is_dir() or paths[0].suffix.lower() in VIDEOS
+        _is_pattern(paths[0]) or paths[0].is_dir() or paths[0].suffix.lower() in VIDEOS
     )
 
 
@@ -145,7 +145,7 @@ def check_given(
                 f"a list where a photograph is expected; give it as --list {path}", subject=path
             )
     for mesh in meshes:
-        is_picture = is_pattern(mesh) or mesh.suffix.lower() in (*IMAGES, *VIDEOS)
+        is_picture = _is_pattern(mesh) or mesh.suffix.lower() in (*IMAGES, *VIDEOS)
         if mesh.is_dir() or is_picture:
             kind = "a photograph" if is_picture else "a folder"
             raise InvalidInputError(

@@ -54,7 +54,7 @@ def install_command(extras: Iterable[str]) -> str:
 
 def check_extras(files: Iterable[Path] = (), packages: Iterable[str] = ()) -> None:
     """Refuse files whose readers are not installed, and missing packages, all in one message."""
-    wanted = [(str(file), package) for file in files if (package := package_of(file))]
+    wanted = [(str(file), package) for file in files if (package := _package_of(file))]
     wanted += [("this command", package) for package in packages]
     missing = [(user, package) for user, package in wanted if not is_installed(package)]
     if not missing:
@@ -64,7 +64,7 @@ def check_extras(files: Iterable[Path] = (), packages: Iterable[str] = ()) -> No
     raise MissingDependencyError(f"{', '.join(needs)}: {command}")
 
 
-def package_of(file: Path) -> str | None:
+def _package_of(file: Path) -> str | None:
     """The optional package that reads a file; None if none is needed, as of a HEIC that holds a
     JPEG."""
     package = PACKAGE_OF_SUFFIX.get(file.suffix.lower())

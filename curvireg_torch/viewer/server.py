@@ -64,7 +64,7 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
     with terminable(), listen(host, port) as listener, uploads as folder:
         workspace = Workspace(options, Path(folder))
         workspace.load()  # errors come before anything opens
-        add_page(workspace)
+        _add_page(workspace)
         server = make_server(listener, host, browser_folder=Path(folder) if browser else None)
         hangup = signals_handled(hangup_signals(), server.handle_exit)  # uvicorn handles the others
         with one_torch_thread(), warnings.catch_warnings(), hangup:
@@ -225,7 +225,7 @@ def _is_loopback(host: str) -> bool:
         return host.lower() == "localhost"
 
 
-def add_page(workspace: Workspace) -> None:
+def _add_page(workspace: Workspace) -> None:
     """Add the page, its files and its uploads to the application of NiceGUI."""
 
     def send_file(name: str) -> Response:

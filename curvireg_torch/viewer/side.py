@@ -324,7 +324,7 @@ class CameraPanel:
         await self._set(typed, 1, "the horizontal field of view in degrees, such as 65")
 
     async def _set(self, typed: str, count: int, expected: str) -> None:
-        found = typed_numbers(typed, count)
+        found = _typed_numbers(typed, count)
         if found is None:
             self.workspace.messages["camera"] = f"camera: expected {expected}, got {typed!r:.80}"
         elif count == 4:
@@ -380,7 +380,7 @@ class CameraPanel:
         return "unknown: the focal length is estimated, and the distance with it"
 
 
-def typed_numbers(text: str, count: int) -> tuple[float, ...] | None:
+def _typed_numbers(text: str, count: int) -> tuple[float, ...] | None:
     """The ``count`` numbers of a text, none of an empty one, or None of any other. They are
     separated by blanks, semicolons or commas; where these are not needed for that, commas are
     decimal ones.

@@ -227,7 +227,7 @@ class Stage:
             while self.moved is not None and self.moved is not drawn:
                 drawn = self.moved
                 layers = await asyncio.to_thread(
-                    pose_layers, registrar, (drawn, K), shot.size, MOVING_SIDE
+                    _pose_layers, registrar, (drawn, K), shot.size, MOVING_SIDE
                 )
                 if self.moved is not None:
                     self._show_layers(layers)
@@ -361,7 +361,7 @@ class Stage:
             return
         registrar = shot.require_result().registrar
         projection = shot.projection
-        draw = partial(pose_layers, registrar, projection, shot.size, LAYER_SIDE)
+        draw = partial(_pose_layers, registrar, projection, shot.size, LAYER_SIDE)
         if layers := await self.workspace.run("page", draw):
             self._show_layers(layers)
             self.canvas.props(f'data-object="{_extent(self.mask)}"')
@@ -410,7 +410,7 @@ def _extent(mask: np.ndarray) -> str:
     return " ".join(f"{v:.4f}" for v in box)
 
 
-def pose_layers(
+def _pose_layers(
     registrar: Registrar, projection: tuple[Tensor, Tensor], size: tuple[int, int], side: int
 ) -> tuple[bytes, bytes, np.ndarray]:
     """Two transparent PNGs over a photograph of ``size`` (H, W), at most ``side`` px long: the

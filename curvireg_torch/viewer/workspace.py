@@ -230,7 +230,7 @@ class Workspace:
         try:
             return Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder), name)
         except OSError as error:
-            raise cannot_store(name, error) from error
+            raise _cannot_store(name, error) from error
 
     async def _store(self, path: Path, size: int, blocks: AsyncIterator[bytes]) -> None:
         received = 0
@@ -244,7 +244,7 @@ class Workspace:
                         )
                     await asyncio.to_thread(file.write, block)
         except OSError as error:
-            raise cannot_store(path.name, error) from error
+            raise _cannot_store(path.name, error) from error
 
     async def _open_upload(self, path: Path) -> None:
         suffix = path.suffix.lower()
@@ -392,7 +392,7 @@ class Workspace:
         return f"file/{name}?v={self._version}"
 
 
-def cannot_store(name: str, error: OSError) -> OutputError:
+def _cannot_store(name: str, error: OSError) -> OutputError:
     """The error of a file for which there is no place."""
     advice = "make room on the machine on which the page runs, and send it again"
     return OutputError(f"{name}: cannot be stored ({error.strerror or error}); {advice}")
@@ -448,7 +448,7 @@ def unpack(archive: Path, folder: Path) -> Path:
         raise
     except Exception as error:  # zipfile raises many kinds
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise cannot_store(name, error) from None
+            raise _cannot_store(name, error) from None
         raise InvalidInputError(
             f"{name}: the archive cannot be unpacked; pack it again, without a password"
         ) from None

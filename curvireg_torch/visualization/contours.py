@@ -42,7 +42,7 @@ class Drawn:
     box: Sequence[float] | None
 
 
-def line_width(size: Sequence[int]) -> float:
+def _line_width(size: Sequence[int]) -> float:
     """Width of the outline in px in a picture of ``size`` (H, W)."""
     return max(1.5, max(size) / 350)
 
@@ -107,7 +107,7 @@ def _draw_axis(picture: np.ndarray, ends: Tensor, T: Tensor, K: Tensor) -> None:
     if float(depth.min()) <= 0.0:
         return
     start, end = projected(ends.to(T), T, K.to(T)).round().int().tolist()
-    width = max(2, round(line_width(picture.shape[:2])))
+    width = max(2, round(_line_width(picture.shape[:2])))
     for colour, thickness in ((RIM, width + 2), (AXIS, width)):
         cv2.arrowedLine(picture, start, end, colour, thickness, cv2.LINE_AA, tipLength=0.08)
 
@@ -117,7 +117,7 @@ def _draw_box(picture: np.ndarray, resize: Tensor, box: Sequence[float]) -> None
     x0, y0, x1, y1 = box
     corners = resize @ torch.tensor([[x0, x1], [y0, y1], [1.0, 1.0]], dtype=torch.float64)
     start, end = corners[:2].mT.round().int().tolist()
-    width = max(1, round(line_width(picture.shape[:2]) / 3))
+    width = max(1, round(_line_width(picture.shape[:2]) / 3))
     for colour, thickness in ((RIM, width + 2), (BOX, width)):
         cv2.rectangle(picture, start, end, colour, thickness)
 
@@ -152,7 +152,7 @@ def contour_layer(
     drawn = outline | inner
     if not drawn.any():
         return layer
-    width = line_width(size)
+    width = _line_width(size)
     margin = int(3 * width) + 2
     rows = np.nonzero(drawn.any(axis=1))[0]
     columns = np.nonzero(drawn.any(axis=0))[0]

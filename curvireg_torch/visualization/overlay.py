@@ -77,7 +77,7 @@ def contour_overlay(
     H, W = item.size
     describer = registrar.of_mesh(getattr(result, "mesh_index", 0)).describer
     more = drawn_copies(registrar, copies)
-    axis = axis_ends(registrar, result) if isinstance(result, Registration) else None
+    axis = _axis_ends(registrar, result) if isinstance(result, Registration) else None
     whole = (0, 0, W, H)
     box_sides = item.box.tolist()
     return draw_window(
@@ -85,7 +85,7 @@ def contour_overlay(
     )
 
 
-def axis_ends(registrar: Registrar, result: Registration) -> Tensor | None:
+def _axis_ends(registrar: Registrar, result: Registration) -> Tensor | None:
     """(2, 3) start and end, in the model's frame, of the arrow that shows the axis where it alone
     is reliable; else None."""
     target = registrar.of_mesh(result.mesh_index)
@@ -221,7 +221,7 @@ def registration_sheet(
     """
     item = as_photograph(image, as_numbers(box, "box"))
     more = drawn_copies(registrar, copies)
-    axis = axis_ends(registrar, result)
+    axis = _axis_ends(registrar, result)
     if axis is not None:
         note = f"Blue: the axis, which is certain; the turn about it is not. {note}"
     registrar = registrar.of_mesh(result.mesh_index)

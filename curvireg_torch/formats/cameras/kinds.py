@@ -116,7 +116,7 @@ class Format:
     inherits: bool = False
 
 
-def camera_from(
+def _camera_from(
     matrix: Sequence[float],
     distortion: Sequence[float] = (),
     model: str = RADIAL_TANGENTIAL,
@@ -124,7 +124,7 @@ def camera_from(
 ) -> CameraRecord:
     """The camera with fx, fy, cx, cy or a matrix row by row, or column by column, and a size of (H,
     W)."""
-    rows = matrix_rows(matrix)
+    rows = _matrix_rows(matrix)
     if 0.0 < rows[0][0] < MAX_FRACTION and max(rows[0][2], rows[1][2]) < MAX_FRACTION:
         raise InvalidInputError(
             "camera matrix: in fractions of the picture, not in px; multiply fx and cx by its "
@@ -133,7 +133,7 @@ def camera_from(
     return CameraRecord(tuple(map(tuple, rows)), tuple(distortion), model, size)
 
 
-def matrix_rows(numbers: Sequence[float]) -> list[list[float]]:
+def _matrix_rows(numbers: Sequence[float]) -> list[list[float]]:
     """The 3 x 3 matrix of 4 numbers fx, fy, cx, cy; or of a 3 x 3, 3 x 4 or 4 x 4 matrix, row by
     row, or, as Open3D and ARKit write it, column by column: there cx and cy stand in the last
     row."""
@@ -162,8 +162,8 @@ def matrix_rows(numbers: Sequence[float]) -> list[list[float]]:
     return [list(column) for column in zip(*rows, strict=True)] if by_column else rows
 
 
-def read_matrix(record: Record) -> list[float]:
-    """The numbers of the camera matrix, as :func:`matrix_rows` takes them."""
+def _read_matrix(record: Record) -> list[float]:
+    """The numbers of the camera matrix, as :func:`_matrix_rows` takes them."""
     if numbers := record.numbers(*MATRIX):
         return numbers
     singles = {names[0]: record.numbers(*names) for names in (*FOCAL, *CENTRE)}
@@ -180,12 +180,12 @@ def read_matrix(record: Record) -> list[float]:
     return [value for numbers in singles.values() for value in numbers]
 
 
-def read_model(record: Record) -> str | None:
+def _read_model(record: Record) -> str | None:
     """OpenCV's model, or None if the record names none."""
     flags = record.get(*FISHEYE_FLAGS)
     if flags is not None and flags not in (0, False):
         return FISHEYE
-    named = [model_of(text) for text in record.words(*MODEL_NAMES) if text]
+    named = [_model_of(text) for text in record.words(*MODEL_NAMES) if text]
     for text in _other_models(record):
         name = _plain_model(text)
         is_pinhole = name.startswith(PINHOLE_OF_ZEROS) and not any(
@@ -194,7 +194,7 @@ def read_model(record: Record) -> str | None:
         if is_pinhole:
             named.append(RADIAL_TANGENTIAL)
         elif name in MODELS or name.startswith(UNSUPPORTED):
-            named.append(model_of(text))
+            named.append(_model_of(text))
     if not named:
         return None if flags is None else RADIAL_TANGENTIAL
     return FISHEYE if FISHEYE in named else RADIAL_TANGENTIAL
@@ -215,7 +215,7 @@ def _plain_model(text: str) -> str:
     return plain(text).removeprefix("rs2").removeprefix("distortion")
 
 
-def model_of(text: str) -> str:
+def _model_of(text: str) -> str:
     """OpenCV's model of another tool's name."""
     name = _plain_model(text)
     if name not in MODELS:
@@ -225,18 +225,18 @@ def model_of(text: str) -> str:
     return MODELS[name]
 
 
-def read_distortion(record: Record, model: str | None) -> list[float]:
+def _read_distortion(record: Record, model: str | None) -> list[float]:
     """The coefficients in OpenCV's order; of a list, of single keys, or of keys in a dict."""
     if (inside := record.inside(*DISTORTION)) is not None and inside.get("data") is None:
-        return single_coefficients(inside, model)
+        return _single_coefficients(inside, model)
     if numbers := record.numbers(*DISTORTION):
         if model == FISHEYE and len(numbers) == 5 and numbers[4] == 0.0:
             return numbers[:4]  # librealsense has room for five
         return padded(numbers) if len(numbers) < 3 else numbers
-    return single_coefficients(record, model)
+    return _single_coefficients(record, model)
 
 
-def single_coefficients(record: Record, model: str | None) -> list[float]:
+def _single_coefficients(record: Record, model: str | None) -> list[float]:
     """The coefficients of keys k1, k2, ..., or of one list of radial and one of tangential ones."""
     radial = record.numbers(*RADIAL)
     tangential = record.numbers(*TANGENTIAL)
@@ -271,7 +271,7 @@ def padded(coefficients: Sequence[float]) -> list[float]:
     return [*values, *[0.0] * (count - len(values))]
 
 
-def read_size(record: Record) -> list[float]:
+def _read_size(record: Record) -> list[float]:
     """The numbers of the picture's size: width, height, or in the order of the file."""
     inside = record.inside(*SIZES)
     if inside is not None and inside.has(*WIDTH):
@@ -282,7 +282,7 @@ def read_size(record: Record) -> list[float]:
     return sides or record.numbers(*WIDTH) + record.numbers(*HEIGHT)
 
 
-def checked_size(size: Sequence[float]) -> tuple[int, int] | None:
+def _checked_size(size: Sequence[float]) -> tuple[int, int] | None:
     """(H, W) of width and height."""
     if len(size) not in (0, 2) or any(side != int(side) for side in size):
         raise InvalidInputError(
@@ -291,11 +291,11 @@ def checked_size(size: Sequence[float]) -> tuple[int, int] | None:
     return (int(size[1]), int(size[0])) if size else None
 
 
-def plain_camera(record: Record) -> CameraRecord:
+def _plain_camera(record: Record) -> CameraRecord:
     """A camera with OpenCV's conventions, and a size of width, height."""
-    model = read_model(record)
-    matrix = read_matrix(record)
-    distortion = read_distortion(record, model)
+    model = _read_model(record)
+    matrix = _read_matrix(record)
+    distortion = _read_distortion(record, model)
     if model is None and len(distortion) == 4 and flattened(record.get(*DISTORTION)):
         warnings.warn(
             CurviregWarning(
@@ -304,11 +304,11 @@ def plain_camera(record: Record) -> CameraRecord:
             ),
             stacklevel=2,
         )
-    size = checked_size(read_size(record))
-    return camera_from(matrix, distortion, model or RADIAL_TANGENTIAL, size)
+    size = _checked_size(_read_size(record))
+    return _camera_from(matrix, distortion, model or RADIAL_TANGENTIAL, size)
 
 
-def is_plain(record: Record) -> bool:
+def _is_plain(record: Record) -> bool:
     counts = [
         len(flattened(value)) for key, value in record.values.items() if plain(key) in _PLAIN_MATRIX
     ]
@@ -328,7 +328,7 @@ _PLAIN_PAIRS = {plain(name) for names in PAIRS for name in names}
 def _unknown_order(record: Record) -> CameraRecord:
     """MegaPose writes height, width and others width, height: the principal point lies near the
     centre."""
-    camera = plain_camera(record)
+    camera = _plain_camera(record)
     if camera.size is None:
         return camera
     cx, cy = (row[2] for row in camera.matrix[:2])
@@ -361,7 +361,7 @@ def _is_matlab(record: Record) -> bool:
 def _matlab(record: Record) -> CameraRecord:
     """The properties of a ``cameraIntrinsics``: pixels count from 1, and the size is rows,
     columns."""
-    camera = plain_camera(record)
+    camera = _plain_camera(record)
     columns, rows, last = camera.matrix
     matrix = ((*columns[:2], columns[2] - 1.0), (*rows[:2], rows[2] - 1.0), last)
     return replace(camera, matrix=matrix, size=camera.size and camera.size[::-1])
@@ -370,7 +370,7 @@ def _matlab(record: Record) -> CameraRecord:
 def _own_result(record: Record) -> CameraRecord:
     """The object "camera" of result.json: its size is height, width. A focal length that was
     estimated remains as uncertain as it was."""
-    camera = plain_camera(record)
+    camera = _plain_camera(record)
     if camera.size is not None:
         camera = replace(camera, size=(camera.size[1], camera.size[0]))
     deviations = record.numbers("focal_deviation")
@@ -382,7 +382,7 @@ def _own_result(record: Record) -> CameraRecord:
 
 
 def _ros(record: Record) -> CameraRecord:
-    return _region(record, plain_camera(record))
+    return _region(record, _plain_camera(record))
 
 
 def _ros_rectified(record: Record) -> CameraRecord:
@@ -390,9 +390,9 @@ def _ros_rectified(record: Record) -> CameraRecord:
     numbers = record.numbers("P", "projection_matrix")
     if len(numbers) != 12:
         raise InvalidInputError(f"projection matrix: expected 12 numbers, got {len(numbers)}")
-    plain_camera(record)  # reads, and so checks, the rest
+    _plain_camera(record)  # reads, and so checks, the rest
     rows = [value for start in (0, 4, 8) for value in numbers[start : start + 3]]
-    return _region(record, camera_from(rows, size=checked_size(read_size(record))))
+    return _region(record, _camera_from(rows, size=_checked_size(_read_size(record))))
 
 
 def _region(record: Record, camera: CameraRecord) -> CameraRecord:
@@ -418,7 +418,7 @@ def _region(record: Record, camera: CameraRecord) -> CameraRecord:
 
 def _nerfstudio(record: Record) -> CameraRecord:
     """Of nerfstudio and instant-ngp: pixels count from the picture's corner, as COLMAP's."""
-    model = read_model(record)
+    model = _read_model(record)
     width = record.number("w")
     height = record.number("h")
     if (fx := record.number("fl_x")) is None:
@@ -432,9 +432,9 @@ def _nerfstudio(record: Record) -> CameraRecord:
         raise InvalidInputError(
             "distortion: k4 of nerfstudio is not OpenCV's; calibrate without it"
         )
-    distortion = single_coefficients(record, model)
-    size = checked_size([side for side in (width, height) if side is not None])
-    return camera_from([fx, fy, cx - 0.5, cy - 0.5], distortion, model or RADIAL_TANGENTIAL, size)
+    distortion = _single_coefficients(record, model)
+    size = _checked_size([side for side in (width, height) if side is not None])
+    return _camera_from([fx, fy, cx - 0.5, cy - 0.5], distortion, model or RADIAL_TANGENTIAL, size)
 
 
 OPENSFM = dict.fromkeys(
@@ -451,7 +451,7 @@ def _opensfm(record: Record) -> CameraRecord:
         raise InvalidInputError(
             f"camera model {name!r:.40} is not supported; choose from {', '.join(OPENSFM)}"
         )
-    size = checked_size(record.numbers(*WIDTH) + record.numbers(*HEIGHT))
+    size = _checked_size(record.numbers(*WIDTH) + record.numbers(*HEIGHT))
     fx = record.number("focal_x", "focal")
     if size is None or fx is None:
         raise InvalidInputError("no width, height and focal length; export the cameras again")
@@ -461,8 +461,8 @@ def _opensfm(record: Record) -> CameraRecord:
     cx = longer * (record.number("c_x") or 0.0) + (W - 1) / 2
     cy = longer * (record.number("c_y") or 0.0) + (H - 1) / 2
     model = OPENSFM[name]
-    return camera_from(
-        [longer * fx, longer * fy, cx, cy], single_coefficients(record, model), model, size
+    return _camera_from(
+        [longer * fx, longer * fy, cx, cy], _single_coefficients(record, model), model, size
     )
 
 
@@ -470,7 +470,7 @@ def _kitti(record: Record) -> CameraRecord:
     """The left 3 x 3 of a projection matrix of KITTI, whose last column is the place of the camera
     beside the first one."""
     numbers = record.numbers("kitti")
-    return camera_from([value for start in (0, 4, 8) for value in numbers[start : start + 3]])
+    return _camera_from([value for start in (0, 4, 8) for value in numbers[start : start + 3]])
 
 
 # numbers of focal lengths and of coefficients, which are the first ones of OpenCV, and the model
@@ -506,18 +506,18 @@ def _colmap(record: Record) -> CameraRecord:
     if distortion:
         distortion = [*distortion, 0.0, 0.0, 0.0][: max(4, count)]
     matrix = [values[0], values[focals - 1], cx - 0.5, cy - 0.5]
-    return camera_from(matrix, distortion, model, checked_size([width, height]))
+    return _camera_from(matrix, distortion, model, _checked_size([width, height]))
 
 
 def _metashape(record: Record) -> CameraRecord:
     """Of Agisoft Metashape: cx and cy count from the picture's centre, p1 and p2 change places, k4
     is a power of r."""
-    size = read_size(record)
+    size = _read_size(record)
     if len(size) != 2:
         raise InvalidInputError("no width and height beside f; export the calibration again")
     names = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
     values = {name: record.number(name) or 0.0 for name in names}
-    model = read_model(record) or RADIAL_TANGENTIAL
+    model = _read_model(record) or RADIAL_TANGENTIAL
     unread = [name for name in ("b2", "p3", "p4") if values[name]]
     unread += ["k4"] if values["k4"] and model != FISHEYE else []
     unread += [name for name in ("p1", "p2") if values[name] and model == FISHEYE]
@@ -532,8 +532,8 @@ def _metashape(record: Record) -> CameraRecord:
     lens = (
         radial if model == FISHEYE else padded([*radial[:2], values["p2"], values["p1"], radial[2]])
     )
-    return camera_from(
-        [values["f"] + values["b1"], values["f"], cx, cy], lens, model, checked_size(size)
+    return _camera_from(
+        [values["f"] + values["b1"], values["f"], cx, cy], lens, model, _checked_size(size)
     )
 
 
@@ -542,7 +542,7 @@ def _kannala_brandt(record: Record) -> CameraRecord:
     matrix = [value for name in ("mu", "mv", "u0", "v0") for value in record.numbers(name)]
     distortion = [value for name in ("k2", "k3", "k4", "k5") for value in record.numbers(name)]
     record.words(*MODEL_NAMES)
-    return camera_from(matrix, distortion, FISHEYE, checked_size(read_size(record)))
+    return _camera_from(matrix, distortion, FISHEYE, _checked_size(_read_size(record)))
 
 
 def _mei(record: Record) -> CameraRecord:
@@ -613,7 +613,7 @@ FORMATS = (
     Format(
         "ROS",
         lambda record: (
-            is_plain(record) and record.has("P", "projection_matrix", "binning_x", "roi")
+            _is_plain(record) and record.has("P", "projection_matrix", "binning_x", "roi")
         ),
         _ros,
         {"P": _ros_rectified},
@@ -625,6 +625,6 @@ FORMATS = (
     ),
     Format("MATLAB", _is_matlab, _matlab),
     Format("MegaPose", _has_pair_of_sides, _unknown_order),
-    Format("OpenCV", is_plain, plain_camera),
+    Format("OpenCV", _is_plain, _plain_camera),
 )
 """The first that detects a dict reads it."""

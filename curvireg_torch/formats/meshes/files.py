@@ -152,7 +152,7 @@ def _check_start(path: Path) -> None:
             )
 
 
-def read_off(source: MeshSource) -> ReadMesh:
+def _read_off(source: MeshSource) -> ReadMesh:
     """Read an OFF file; colours are ignored."""
     data = plain_text(source.data())
     if data.count(b"\n") > MAX_MESH_LINES:
@@ -177,7 +177,7 @@ READERS: dict[str, Callable[[MeshSource], ReadMesh]] = {
     ".iges": read_step,
     ".igs": read_step,
     ".obj": read_obj,
-    ".off": read_off,
+    ".off": _read_off,
     ".ply": read_ply,
     ".step": read_step,
     ".stl": read_stl,

@@ -25,7 +25,7 @@ def main() -> None:
     path, out, most_parts, most_faces = sys.argv[1:]
     arrays: dict[str, Any] = {}
     try:
-        layers = used_layers(path)
+        layers = _used_layers(path)
         about = read(path, arrays, int(most_parts), int(most_faces))
         about["layers"] = layers
     except ValueError as error:
@@ -37,7 +37,7 @@ def main() -> None:
     np.savez(out, about=np.array(json.dumps(about)), **arrays)
 
 
-def used_layers(path: str) -> list[str]:
+def _used_layers(path: str) -> list[str]:
     """The files beside the first one that a stage would open, which must lie in its folder or
     package."""
     folder = Path(path).resolve().parent
@@ -51,7 +51,7 @@ def used_layers(path: str) -> list[str]:
             if identifier == path:
                 raise ValueError("not a USD file, or damaged")
             continue  # a stage goes on without it
-        layer.Traverse("/", refuse_clips(layer))
+        layer.Traverse("/", _refuse_clips(layer))
         # a part that refers to another of the same file names none
         for name in filter(None, layer.GetCompositionAssetDependencies()):
             target = layer.ComputeAbsolutePath(name)
@@ -75,7 +75,7 @@ def is_inside(package: str, path: str, folder: Path) -> bool:
     return not path.lower().endswith(".usdz") and Path(package).resolve().is_relative_to(folder)
 
 
-def refuse_clips(layer: Any) -> Any:
+def _refuse_clips(layer: Any) -> Any:
     """A visitor that refuses animation by further files."""
 
     def visit(place: Any) -> None:
@@ -151,7 +151,7 @@ def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | N
     arrays[key + "counts"] = counts
     arrays[key + "indices"] = own.reshape(-1)
     holes = np.array(mesh.GetHoleIndicesAttr().Get(now) or [], np.int64)
-    colour = by_corner(UsdGeom.Gprim(mesh).GetDisplayColorPrimvar(), counts, indices, len(points))
+    colour = _by_corner(UsdGeom.Gprim(mesh).GetDisplayColorPrimvar(), counts, indices, len(points))
     if colour is not None:
         arrays[key + "colour"] = colour.reshape(-1, 3)
     materials: list[dict[str, Any]] = []
@@ -163,12 +163,12 @@ def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | N
         faces = None if subset is None else np.array(subset.GetIndicesAttr().Get(now) or [])
         if not material or (faces is not None and not faces.size):
             continue
-        surface = surface_of(material)
+        surface = _surface_of(material)
         name = surface.get("coordinates")
         uv = None
         if name:
             primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
-            uv = by_corner(primvar, counts, indices, len(points))
+            uv = _by_corner(primvar, counts, indices, len(points))
         if uv is None:
             surface.pop("texture", None)
         else:
@@ -182,7 +182,7 @@ def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | N
     return {"faces": triangles, "materials": materials, "left_handed": is_left_handed}
 
 
-def by_corner(primvar: Any, counts: Any, indices: Any, vertices: int) -> Any:
+def _by_corner(primvar: Any, counts: Any, indices: Any, vertices: int) -> Any:
     """Values of a primvar for each corner of each face; None if it has none, or too few."""
     if not primvar or not primvar.HasValue():
         return None
@@ -202,7 +202,7 @@ def by_corner(primvar: Any, counts: Any, indices: Any, vertices: int) -> Any:
     return values[index] if index is not None and len(values) >= wanted else None
 
 
-def surface_of(material: Any) -> dict[str, Any]:
+def _surface_of(material: Any) -> dict[str, Any]:
     """The colour of a material, linear, or its texture and the name of its coordinates."""
     shader = material.ComputeSurfaceSource()[0]
     if not shader:
@@ -225,7 +225,7 @@ def texture_of(shader: Any) -> dict[str, Any]:
     asset = file.Get() if file else None
     if asset is None:
         return {"unread": True}
-    found = {"texture": asset.path, **place_of(file, asset), "coordinates": "st"}
+    found = {"texture": asset.path, **_place_of(file, asset), "coordinates": "st"}
     for name in ("scale", "bias"):
         attribute = value_of(shader.GetInput(name))
         value = attribute.Get() if attribute else None
@@ -250,7 +250,7 @@ def value_of(entry: Any) -> Any:
     return found[0] if found else None
 
 
-def place_of(attribute: Any, asset: Any) -> dict[str, str]:
+def _place_of(attribute: Any, asset: Any) -> dict[str, str]:
     """Where the file lies that an asset names, relative to the layer that names it, and what it is
     within that file if that is a package."""
     layer = attribute.GetPropertyStack(Usd.TimeCode.EarliestTime())[0].layer
