@@ -51,8 +51,8 @@ WORDS = {
     "tracebot": "Transparent canisters and a tray",
     "lm": "Two figurines among clutter (LINEMOD)",
     "lmo": "Small objects behind others (LINEMOD-Occlusion)",
-    "pascal3d_mini": "Cars, chairs and other things of the web, with another one's mesh and "
-    "without a camera (PASCAL3D+)",
+    "pascal3d_mini": "Cars, chairs and others on photographs of the web, with the mesh of a "
+    "similar object and without a camera (PASCAL3D+)",
 }
 """What a set shows, in the order of the README's table."""
 
