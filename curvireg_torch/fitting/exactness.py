@@ -40,10 +40,8 @@ class Exactness:
     @property
     def words(self) -> str:
         """The first two in words."""
-        degrees = _one_digit(self.rotation_deg)
-        unit = "degree" if degrees == "1" else "degrees"
         percent = _one_digit(self.distance_percent)
-        return f"to about {degrees} {unit} and {percent} % of the distance"
+        return f"to about {degrees_in_words(self.rotation_deg)} and {percent} % of the distance"
 
 
 def exactness_of(
@@ -97,6 +95,17 @@ def _radius(mean: Tensor, freedom: float) -> float:
     chi-squared distribution of so many degrees of ``freedom``."""
     quantile = 2.0 * float(gammaincinv(0.5 * freedom, LEVEL))
     return math.sqrt(max(float(mean), 0.0) * quantile / freedom)
+
+
+def degrees_in_words(value: float) -> str:
+    """Degrees with one digit.
+
+    Example:
+        >>> degrees_in_words(11.2), degrees_in_words(1.3)
+        ('10 degrees', '1 degree')
+    """
+    degrees = _one_digit(value)
+    return f"{degrees} degree{'s' * (degrees != '1')}"
 
 
 def _one_digit(value: float) -> str:

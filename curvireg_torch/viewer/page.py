@@ -53,9 +53,9 @@ def build_page(workspace: Workspace) -> None:
         stage = Stage(workspace)
         with region("div", "side"):
             steps = Steps(workspace)
-            camera = CameraPanel(workspace)
             answers = Answers(workspace)
             space = Space(workspace)
+            camera = CameraPanel(workspace)
             preview = Preview(workspace)
             inputs = Inputs(workspace)
 
@@ -117,17 +117,17 @@ class Steps:
                                 "quiet",
                             )
                     if name == "mesh":
+                        self.use_mm = button(
+                            "Use mm",
+                            lambda: workspace.set_option("unit", "mm"),
+                            "use-mm",
+                            "quiet below",
+                        )
                         self.facts["advice"] = text("p", "", "facts", data_testid="mesh-advice")
                         self.examine = button(
                             "Look all the same",
                             workspace.examination.start_patiently,
                             "examine",
-                            "quiet below",
-                        )
-                        self.use_mm = button(
-                            "Use mm",
-                            lambda: workspace.set_option("unit", "mm"),
-                            "use-mm",
                             "quiet below",
                         )
         self.messages["file"] = self._message("file")
@@ -196,9 +196,8 @@ class Steps:
         shot = self.session.shot
         if shot.photo is None:
             return (
-                "A picture with the whole object in it, or several. Of several, a rig file (a CSV "
-                "table, COLMAP, BOP) "
-                "makes one pose."
+                "A picture that shows the whole object, or several. With a file of the cameras' "
+                "poses (CSV, COLMAP, BOP), several give one pose together."
             )
         H, W = shot.size
         return "; ".join([f"{self.session.name(shot.path)}: {W} x {H} px", *shot.photo.notes])

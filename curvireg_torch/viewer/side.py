@@ -95,6 +95,7 @@ class Answers:
                 self.word = text("h2", "", data_testid="verdict")
                 self.certainty = text("p", "", title=CONFIDENCE, data_testid="certainty")
                 with region("div", "row"):
+                    text("span", "Save:", "facts")
                     for name in DOWNLOADS:
                         button(
                             name,
@@ -305,17 +306,20 @@ class CameraPanel:
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
         self.session = workspace.session
-        with fold("Camera", "camera"):
-            text("p", CAMERA_HINT, "facts")
-            self.matrix = field("fx fy cx cy in px", "camera", self._set_matrix)
-            self.view = field("or the horizontal field of view in degrees", "fov", self._set_view)
-            with region("div", "row"):
-                file_chooser("From a file", "upload-camera")
-                self.exif = button(
-                    "Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet"
+        with region("div", "fold"):  # a card, which names the camera when its fields are folded
+            with fold("Camera", "camera"):
+                text("p", CAMERA_HINT, "facts")
+                self.matrix = field("fx fy cx cy in px", "camera", self._set_matrix)
+                self.view = field(
+                    "or the horizontal field of view in degrees", "fov", self._set_view
                 )
-        self.facts = text("p", "", "facts", data_testid="camera-facts")
-        self.message = text("p", "", "message", data_testid="message-camera", role="alert")
+                with region("div", "row"):
+                    file_chooser("From a file", "upload-camera")
+                    self.exif = button(
+                        "Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet"
+                    )
+            self.facts = text("p", "", "facts", data_testid="camera-facts")
+            self.message = text("p", "", "message", data_testid="message-camera", role="alert")
 
     async def _set_matrix(self, typed: str) -> None:
         await self._set(typed, 4, "four numbers fx fy cx cy in px, such as 1450 1450 960 540")
@@ -491,7 +495,9 @@ class Space:
         self.shown: Answer | None = None
         with fold("The answer in 3D", "space", is_open=True) as self.section:
             self.place = region("div", "preview", data_testid="space")
-            button("Show camera, photograph and mesh", self._draw, "show-space", "quiet")
+            self.show = button(
+                "Show camera, photograph and mesh", self._draw, "show-space", "quiet"
+            )
 
     async def refresh(self) -> None:
         """Forget what was drawn of another answer."""
@@ -500,6 +506,7 @@ class Space:
         if self.shown is not None and self.shown is not shot.answer:
             self.shown = None
             self.place.clear()
+        self.show.set_visibility(self.shown is None)
 
     async def _draw(self) -> None:
         shot = self.session.shot
@@ -517,11 +524,15 @@ class Space:
             torch.linalg.solve(K.double(), K.new_tensor([x, y, 1]).double()) for x, y in corners
         ]
         self.place.clear()
-        look = {"grid": False, "background_color": "#c8ced3"}
+        look = {
+            "grid": False,
+            "camera": ui.scene.perspective_camera(fov=50),
+            "background_color": "#c8ced3",
+        }
         with self.place, ui.scene(340, 240, **look) as scene:
             # from glTF's axes, y up, to those of the scene, z up; the object is at distance 1
             scene.gltf(url).rotate(math.pi / 2, 0, 0).scale(1.0 / (depth * metres))
             for x, y, _ in (ray.tolist() for ray in rays):
                 scene.line([0, 0, 0], [x, 1.0, -y]).material("#0a6b35")
-            scene.text("camera", "font-weight: bold; color: #1b1f23").move(0, 0, 0)
+            scene.text("camera", "font-weight: bold; color: #1b1f23").move(0, 0, -0.12)
         scene.move_camera(-0.9, -0.5, 0.6, 0, 0.6, 0, duration=0)

@@ -354,6 +354,7 @@ class Stage:
                 f'src="{self.workspace.serve("photograph.jpg", content, "image/jpeg")}"'
             )
             self.viewport.style(f"--ratio: {W / H:.5f}")
+            self.canvas.props(f'data-photo="{time.monotonic()}"')  # page.js then shows it whole
 
     async def _render_answer(self) -> None:
         shot = self.session.shot

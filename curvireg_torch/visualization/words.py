@@ -9,6 +9,7 @@ from torch import Tensor
 from ..geometry.pose_prior import object_frame
 from ..geometry.viewpoint import viewpoint_from_rotation
 from ..utils.choices import SIDE_NAMES
+from .exactness import degrees_in_words
 
 # How sure an answer is, surest first; the last two have no pose
 VERDICTS = ("reliable", "reliable axis", "unsure", "no match", "lost", "failed")
@@ -49,8 +50,8 @@ def _exactness_in_words(exactness: Mapping[str, Any], camera_source: str | None)
     if camera_source != "estimated":
         return f"exact {exactness['words']}, {HOLDS_FOR}"
     return (
-        f"exact to about {exactness['allocentric_deg']:.1g} degrees as seen along the ray to the "
-        f"object: use allocentric_rotation if the photograph may be cropped; in the camera "
+        f"exact to about {degrees_in_words(exactness['allocentric_deg'])} as seen along the ray to "
+        f"the object: use allocentric_rotation if the photograph may be cropped; in the camera "
         f"{exactness['words']}"
     )
 

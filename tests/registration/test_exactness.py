@@ -86,5 +86,9 @@ def test_results_say_how_exact_they_are_and_what_the_distance_holds_for():
     assert "the mesh has the object's size and the focal length is right" in line
     (line,) = remarks({**document, "camera_source": "estimated"})
     assert "use allocentric_rotation" in line
+    for degrees, said in ((0.96, "1 degree as"), (1.6, "2 degrees as"), (11.2, "10 degrees as")):
+        exactness = {**document["exactness"], "allocentric_deg": degrees}
+        (line,) = remarks({**document, "camera_source": "estimated", "exactness": exactness})
+        assert line.startswith(f"exact to about {said} seen along the ray to the object")
     assert document["allocentric_rotation"] == result.allocentric_rotation.tolist()
     assert replace(result, probabilities=(0.5,)).to_dict()["exactness"] is None

@@ -473,6 +473,14 @@ def test_an_answer_is_zoomed_to_and_the_pointer_shows_what_a_drag_does(browser, 
     browser.wait(
         lambda: browser.part("space").find_element("css selector", "canvas"), "the answer in 3D"
     )
+    browser.driver.find_element("css selector", "[data-zoom=fit]").click()
+    browser.wait(lambda: canvas.size["width"] > 1.05 * whole, "the object")
+    (folder / "next.png").write_bytes((folder / "photo.png").read_bytes())
+    browser.drop(folder / "next.png")
+    browser.wait(lambda: browser.text("photograph-facts").startswith("next.png: "), "the next one")
+    browser.wait(lambda: canvas.size["width"] == whole, "another photograph is shown whole")
+    browser.click("no-photo")
+    browser.wait(lambda: browser.text("verdict"), "the former one and its answer")
     browser.click("no-photo")
     browser.click("restore-photo")
     browser.wait(lambda: browser.text("verdict"), "the photograph and its answer are back")

@@ -81,11 +81,13 @@
   }, { passive: false });
 
   const PART_OF_VIEW = 0.6;  // which the object fills after an answer
+  const LEAST_ZOOM = 1.1;  // less is not worth the scroll bars
 
   function zoomToObject(canvas) {
     const [x0, y0, x1, y1] = (canvas.dataset.object || "0 0 1 1").split(" ").map(Number);
     const viewport = canvas.parentElement, frame = viewport.getBoundingClientRect();
-    zoomTo(canvas, PART_OF_VIEW / Math.max(x1 - x0, y1 - y0, 0.05), frame.left, frame.top);
+    const zoom = PART_OF_VIEW / Math.max(x1 - x0, y1 - y0, 0.05);
+    zoomTo(canvas, zoom < LEAST_ZOOM ? 1 : zoom, frame.left, frame.top);
     viewport.scrollLeft = ((x0 + x1) / 2) * canvas.offsetWidth - viewport.clientWidth / 2;
     viewport.scrollTop = ((y0 + y1) / 2) * canvas.offsetHeight - viewport.clientHeight / 2;
   }
@@ -102,8 +104,12 @@
   addEventListener("click", (event) => {
     if (event.target.matches?.("button[data-zoom]")) zoomBy(event.target.dataset.zoom);
   });
-  new MutationObserver((changes) => zoomToObject(changes[0].target))
-    .observe(document.body, { subtree: true, attributeFilter: ["data-answer"] });
+  new MutationObserver((changes) => {
+    for (const { attributeName, target } of changes) {
+      if (attributeName === "data-answer") zoomToObject(target);
+      else zoomTo(target, 1, 0, 0);  // another photograph is shown whole
+    }
+  }).observe(document.body, { subtree: true, attributeFilter: ["data-answer", "data-photo"] });
 
   // --- The pointer shows whether a drag would move the mesh or turn it: the server decides by the same outline.
   const outline = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
