@@ -6,10 +6,10 @@ from typing import Any
 
 from torch import Tensor
 
+from ..fitting.exactness import degrees_in_words
 from ..geometry.pose_prior import object_frame
 from ..geometry.viewpoint import viewpoint_from_rotation
 from ..utils.choices import SIDE_NAMES
-from .exactness import degrees_in_words
 
 # How sure an answer is, surest first; the last two have no pose
 VERDICTS = ("reliable", "reliable axis", "unsure", "no match", "lost", "failed")
