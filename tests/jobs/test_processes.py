@@ -4,6 +4,7 @@ Blocks of photographs are then others than in one undisturbed process, which cha
 """
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -54,13 +55,15 @@ def agrees(value, other):
         return [*value] == [*other] and all(agrees(value[key], other[key]) for key in value)
     if isinstance(value, list | tuple):
         return len(value) == len(other) and all(map(agrees, value, other))
-    if isinstance(value, str) and value != other:
-        words = value.split(), other.split()
+    if value == other:
+        return True
+    if isinstance(value, str):
         try:
-            value, other = ([float(word) for word in some] for some in words)
+            numbers = [[float(word) for word in text.split()] for text in (value, other)]
         except ValueError:
             return False
-    return value == pytest.approx(other, rel=1e-4, abs=1e-6, nan_ok=True)
+        return agrees(*numbers)
+    return isinstance(value, float) and math.isclose(value, other, rel_tol=1e-4, abs_tol=1e-6)
 
 
 @pytest.fixture(params=["bop", "list"])
