@@ -4,6 +4,8 @@
 
 Each run of ``curvireg register --list``, with and without workers, gets SIGKILL, SIGTERM, SIGINT or
 SIGHUP at a random moment before its first row is on disk, between two rows, or after the last one.
+Runs of the last two kinds are forked from this process, which has imported all modules and computed
+nothing: on a busy machine, to import them takes longer than the rows.
 Then no process of its session may be left, and whoever reads its output must come to the end. The
 next run goes on in the same folder; once all rows are there, one that is not disturbed must have
 each row once, in the order of the list and with the poses of an undisturbed run, and the next
@@ -15,16 +17,23 @@ import itertools
 import json
 import os
 import random
+import select
 import signal
-import subprocess
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
+import curvireg_torch.cli.register
+import curvireg_torch.jobs.lists
+import curvireg_torch.jobs.opening  # noqa: F401
 from curvireg_torch import ViewBank, sample_views
+from curvireg_torch.__main__ import main as command_line
 from curvireg_torch.synthetic import demo_scene
 from curvireg_torch.visualization.encoding import png, to_uint8
 from scripts._shared import RESULTS, commit, today, write_json
@@ -93,6 +102,60 @@ class Moment(NamedTuple):
     seconds: float
 
 
+class Process:
+    """A run of the command in a session of its own: a new process, or a fork of this one."""
+
+    def __init__(self, words: list[str], *, is_forked: bool) -> None:
+        self.output, writer = os.pipe()
+        self.code: int | None = None
+        if is_forked:
+            self.pid = os.fork()
+            if not self.pid:
+                _become(words, writer)
+        else:
+            command = [sys.executable, "-m", "curvireg_torch", *words]
+            streams = [(os.POSIX_SPAWN_DUP2, writer, stream) for stream in (1, 2)]
+            self.pid = os.posix_spawn(
+                sys.executable, command, os.environ, file_actions=streams, setsid=True
+            )
+        os.close(writer)
+
+    def poll(self) -> int | None:
+        """The code, if the process has ended."""
+        if self.code is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            self.code = os.waitstatus_to_exitcode(status) if pid else None
+        return self.code
+
+    def read_to_end(self, seconds: float) -> bytes | None:
+        """All that it and its workers print; None if they do not end within so many seconds."""
+        end = time.monotonic() + seconds
+        printed = b""
+        while select.select([self.output], [], [], max(end - time.monotonic(), 0.0))[0]:
+            some = os.read(self.output, 65536)
+            if not some:
+                os.close(self.output)
+                return printed
+            printed += some
+        return None
+
+
+def _become(words: list[str], writer: int) -> NoReturn:
+    """Be ``python -m curvireg_torch``."""
+    code = 70
+    try:
+        os.setsid()
+        os.dup2(writer, 1)
+        os.dup2(writer, 2)
+        sys.argv = ["curvireg", *words]
+        code = command_line()
+    except BaseException:  # of the command: it is printed, as Python would
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
+
+
 class Ended(NamedTuple):
     """A run: its code, the phase in which it got its signal, if it did, and what was wrong with its
     end; the seconds until its first row, its last one, and its end."""
@@ -103,17 +166,19 @@ class Ended(NamedTuple):
     seconds: tuple[float, float, float]
 
 
-def run(words: list[str], out: Path, number: int = 0, moment: Moment | None = None) -> Ended:
+def run(
+    words: list[str],
+    out: Path,
+    number: int = 0,
+    moment: Moment | None = None,
+    *,
+    is_forked: bool = True,
+) -> Ended:
     """Run a command, which gets a signal at a moment, if it has not ended before."""
     known = len(rows_of(out))
     path = out / "results.jsonl"
     begun = time.monotonic()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "curvireg_torch", *words, "--out", str(out)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        start_new_session=True,
-    )
+    process = Process([*words, "--out", str(out)], is_forked=is_forked)
     first = last = reached = 0.0
     phase = ""
     while process.poll() is None:
@@ -126,13 +191,12 @@ def run(words: list[str], out: Path, number: int = 0, moment: Moment | None = No
         if moment is not None and count >= moment.rows and not reached:
             reached = now
         if moment is not None and reached and now >= reached + moment.seconds:
-            process.send_signal(number)
+            os.kill(process.pid, number)
             phase = "before" if count == known else "after" if count == PHOTOGRAPHS else "between"
             break
         time.sleep(0.005)
-    try:
-        printed, _ = process.communicate(timeout=SECONDS_TO_END)
-    except subprocess.TimeoutExpired:
+    printed = process.read_to_end(SECONDS_TO_END)
+    if printed is None:
         left = processes_of(process.pid)
         os.killpg(process.pid, signal.SIGKILL)
         return Ended(-1, phase, f"its pipe stays open: {left}", (first, last, 0.0))
@@ -142,17 +206,19 @@ def run(words: list[str], out: Path, number: int = 0, moment: Moment | None = No
     wrong = f"left behind: {left}" if left else ""
     if b"Traceback" in printed:
         wrong = printed.decode(errors="replace")[-2000:]
-    return Ended(process.returncode, phase, wrong, (first, last, ended - begun))
+    while process.poll() is None:
+        time.sleep(0.01)
+    return Ended(process.code or 0, phase, wrong, (first, last, ended - begun))
 
 
 def moment_in(
-    phase: str, known: int, took: tuple[float, float, float], chance: random.Random
+    phase: str, known: int, took: tuple[float, float, float, float], chance: random.Random
 ) -> Moment:
-    """A random moment of a run that begins with so many rows; ``took`` are the seconds of an
-    undisturbed one."""
-    first, last, end = took
+    """A random moment of a run that begins with so many rows; ``took`` are the seconds until the
+    first row of a new process, and, of a fork, until its first row, its last one and its end."""
+    begin, first, last, end = took
     if phase == "before":
-        return Moment(0, chance.uniform(0.0, first))
+        return Moment(0, chance.uniform(0.0, begin))
     if phase == "after":
         return Moment(PHOTOGRAPHS, chance.uniform(0.0, end - last))
     row = (last - first) / PHOTOGRAPHS
@@ -164,6 +230,9 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=30, help="signals (default: 30)")
     parser.add_argument("--seed", type=int, default=0, help="of the moments (default: 0)")
     arguments = parser.parse_args()
+    # a shell's jobs in the background ignore these
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     chance = random.Random(arguments.seed)
     kinds = list(itertools.product(PHASES, SIGNALS, (1, 2)))
     chance.shuffle(kinds)
@@ -171,22 +240,22 @@ def main() -> None:
     phases: Counter[str] = Counter()
     completed = 0
     with tempfile.TemporaryDirectory() as folder:
-        words = write_list(Path(folder))
+        with ProcessPoolExecutor(1, get_context("spawn")) as executor:
+            words = executor.submit(write_list, Path(folder)).result()
         commands = {jobs: [*words, "--jobs", str(jobs)] for jobs in (1, 2)}
         undisturbed = {jobs: Path(folder, f"undisturbed-{jobs}") for jobs in (1, 2)}
-        run(words, Path(folder, "warm"))  # files are in the memory of the system from now on
+        begin, _, _ = run(words, Path(folder, "new"), is_forked=False).seconds
         took = {}
         for jobs, command in commands.items():
             done = run(command, undisturbed[jobs])
             assert (done.code, done.wrong) == (0, ""), done
-            took[jobs] = done.seconds
+            took[jobs] = (begin, *done.seconds)
         assert agree(undisturbed[2], undisturbed[1]), "other rows by workers"
         out = Path(folder, "0")
         for count, (phase, number, jobs) in enumerate(itertools.cycle(kinds)):
             known = {row["key"] for row in rows_of(out)}
-            done = run(
-                commands[jobs], out, number, moment_in(phase, len(known), took[jobs], chance)
-            )
+            moment = moment_in(phase, len(known), took[jobs], chance)
+            done = run(commands[jobs], out, number, moment, is_forked=phase != "before")
             reached = done.phase if done.code else "ended before"
             label = f"{number.name} {reached}, --jobs {jobs}"
             keys = [row["key"] for row in rows_of(out)]

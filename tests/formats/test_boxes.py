@@ -12,6 +12,7 @@ from PIL import Image
 
 from curvireg_torch.errors import CurviregWarning, InvalidInputError, MissingFileError
 from curvireg_torch.formats.boxes import BoxFile, PictureSize, pixel_box, read_boxes
+from curvireg_torch.formats.boxes.finder import _has_proportions
 from curvireg_torch.formats.pictures import oriented, picture_size
 from curvireg_torch.jobs.options import with_advice
 from curvireg_torch.registration.photograph import as_photographs
@@ -406,3 +407,12 @@ def test_messages_name_the_format_that_is_suspected():
         (found,) = as_photographs(pictures, [box], None)
         assert words in with_advice(found)
         assert "--" not in str(found)
+
+
+@pytest.mark.parametrize(("size", "axis"), [((1000, 4000), 0), ((4000, 1000), 1)])
+@pytest.mark.parametrize(("more", "expected"), [(0, True), (1, True), (3, False)])
+def test_sides_of_a_smaller_picture_are_rounded(size, axis, more, expected):
+    """One pixel of the shorter side is four of the longer one."""
+    smaller = [side // 10 for side in size]
+    smaller[axis] += more
+    assert _has_proportions(size, tuple(smaller)) == expected

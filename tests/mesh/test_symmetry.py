@@ -4,7 +4,7 @@ import torch
 import trimesh
 
 from curvireg_torch.mesh import mesh_symmetries
-from curvireg_torch.mesh.symmetry import feature_fractions
+from curvireg_torch.mesh.symmetry import _axes, feature_fractions
 from curvireg_torch.synthetic import example_mesh
 
 ROTATED = trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9]))
@@ -60,3 +60,12 @@ def test_a_plain_shape_has_no_feature_wherever_it_stands():
     symmetries = mesh_symmetries(post)
     assert len(symmetries) == 8
     assert float(feature_fractions(post, symmetries).max()) < 1e-3
+
+
+@pytest.mark.parametrize(("extents", "count"), [((1, 1, 1), 3), ((1, 1, 3), 4), ((1, 2, 3), 6)])
+def test_principal_axes_that_rounding_decides_are_not_tried(extents, count):
+    """Beside the three axes of the file, those whose moments differ from the others."""
+    box = trimesh.creation.box(extents)
+    box.apply_transform(ROTATED)
+    cloud = trimesh.sample.sample_surface(box, 40_000, seed=0)[0]
+    assert len(_axes(np.asarray(cloud))) == count

@@ -91,6 +91,12 @@ def test_ambiguity():
         )
 
 
+def test_of_several_meshes_none_is_right_where_all_of_them_are_improbable():
+    """The poses of the best one alone leave room for the others."""
+    found = replace(registration(), probabilities=(0.4, 0.1), mesh_probabilities=(0.5, 0.3))
+    assert found.no_match_probability == pytest.approx(0.2)
+
+
 def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_determine():
     sure = replace(registration(covariance=0.01 * torch.eye(6).double()), probabilities=(0.9, 0.0))
     assert sure.reliable
