@@ -147,6 +147,8 @@ def _become(words: list[str], writer: int) -> NoReturn:
         os.setsid()
         os.dup2(writer, 1)
         os.dup2(writer, 2)
+        sys.stdout = os.fdopen(1, "w", closefd=False)
+        sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
         sys.argv = ["curvireg", *words]
         code = command_line()
     except BaseException:  # of the command: it is printed, as Python would
