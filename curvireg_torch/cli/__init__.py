@@ -20,7 +20,7 @@ from ..jobs.options import with_advice
 from ..utils.files import as_stored, terminable
 from ..version import __version__
 from . import commands, compare, follow, inspect, register
-from .options import Parser, ignored_option, join_numbers
+from .options import CONFLICTS, Parser, conflict, given_options, join_numbers
 
 __all__ = ["build_parser", "main", "parse"]
 
@@ -99,7 +99,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
             setattr(arguments, name, [as_stored(path) for path in value])
     if hasattr(arguments, "paths") and (problem := register.complete(arguments)):
         parser.error(f"register: {problem}")
-    if problem := ignored_option(arguments):
+    if problem := conflict(CONFLICTS, given_options(arguments)):
         parser.error(problem)
     return arguments
 

@@ -3,7 +3,7 @@
 
 import argparse
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -132,39 +132,52 @@ def input_files(arguments: argparse.Namespace, *more: Path) -> list[Path]:
     return [*more, *map(Path, filter(None, [*paths, *named_parts]))]
 
 
-_ALTERNATIVES = {
-    ("preset", "pipeline"): "expected one of --preset and --pipeline",
-    (
-        "camera",
-        "guess",
-    ): "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG",
-    ("box", "boxes"): "expected one of --box and --boxes",
-    ("boxes", "mask"): "expected one of --boxes and --mask",
-    ("boxes", "start"): "--start is the pose, so that no box is needed; leave --boxes out",
-    ("boxes", "list"): "the list holds boxes; leave --boxes out",
-    ("box", "start"): "--start is the pose, so that no box is needed; leave --box out",
+CONFLICTS = {
+    "preset pipeline": "expected one of --preset and --pipeline",
+    "camera guess": "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG",
+    "box boxes": "expected one of --box and --boxes",
+    "boxes mask": "expected one of --boxes and --mask",
+    "boxes start": "--start is the pose, so that no box is needed; leave --boxes out",
+    "boxes list": "the list holds boxes; leave --boxes out",
+    "box start": "--start is the pose, so that no box is needed; leave --box out",
+    "box_format !box !list": "--box-format: of --box or the boxes of a list; give them too",
+    "scheduler jobs": "expected one of --jobs and --scheduler",
+    "gpu jobs": "--jobs: processes are for the CPU; a GPU registers photographs together",
+    "front !limits !list": "--front limits nothing by itself; give --azimuth, for instance",
 }
-"""Options of which one would be ignored, and what is said about them."""
+"""Options of any command that conflict, see :func:`conflict`, and what is said about them."""
 
 
-def ignored_option(arguments: argparse.Namespace) -> str | None:
-    """What is wrong with options of any command that would be ignored beside others; None if none
-    would."""
-    for names, message in _ALTERNATIVES.items():
-        if all(getattr(arguments, name, None) is not None for name in names):
+def given_options(arguments: argparse.Namespace) -> set[str]:
+    """The names of the options that are given, and what follows from them: ``limits`` of the pose
+    beside ``front``, and ``gpu``."""
+    options = dict(vars(arguments))
+    for name in ("jobs", "every"):
+        if options.get(name) == 1:
+            del options[name]
+    given = {name for name, value in options.items() if value not in (None, [])}
+    given -= {name for name in given if options[name] is False}
+    if not given.isdisjoint(PRIOR_OPTIONS.keys() - {"front"}):
+        given.add("limits")
+    if options.get("device") not in (None, "cpu"):
+        given.add("gpu")
+    return given
+
+
+def conflict(rules: Mapping[str, str], given: Set[str]) -> str | None:
+    """What the first rule says that holds, None if none does. A rule is a line of names, of which
+    all must be given: of ``a|b`` one of them, and ``!a`` must not be.
+
+    Example:
+        >>> conflict({"box|mask start": "leave one out", "need !strict": "give it"}, {"need"})
+        'give it'
+    """
+    for names, message in rules.items():
+        if all(
+            name[1:] not in given if name[0] == "!" else not given.isdisjoint(name.split("|"))
+            for name in names.split()
+        ):
             return message
-    if getattr(arguments, "box_format", None) is not None and not (
-        arguments.box or getattr(arguments, "list", None)
-    ):
-        return "--box-format: of --box or the boxes of a list; give them too"
-    if getattr(arguments, "scheduler", None) is not None and arguments.jobs > 1:
-        return "expected one of --jobs and --scheduler"
-    on_gpu = getattr(arguments, "device", None) not in (None, "cpu")
-    if on_gpu and getattr(arguments, "jobs", 1) > 1:
-        return "--jobs: processes are for the CPU; a GPU registers photographs together"
-    given = [name for name in PRIOR_OPTIONS if getattr(arguments, name, None) is not None]
-    if given == ["front"] and getattr(arguments, "list", None) is None:
-        return "--front limits nothing by itself; give --azimuth, for instance"
     return None
 
 

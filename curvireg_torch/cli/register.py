@@ -23,6 +23,8 @@ from .options import (
     add_limits,
     add_options,
     add_workers,
+    conflict,
+    given_options,
     input_files,
     numbers_among,
     register_options,
@@ -153,12 +155,49 @@ def add_register(commands: Any) -> None:
     add("--out", type=Path, metavar="DIR", help="folder of the results; made if it does not exist")
 
 
+NO_CAMERA = f"needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
+CONFLICTS = {
+    "missing": "expected PHOTO MESH, PHOTO ... --mesh MESH, or --list FILE MESH",
+    "!out !json": "expected --out DIR, or --json",
+    "views list|start|no_mesh": "--views takes one or several meshes, and neither --list nor "
+    "--start",
+    "box|boxes|mask instances": "--instances applies only without a box; leave --box and --mask "
+    "out",
+    "start|views instances": "--start and --views are of one object; leave --instances out",
+    "hypotheses start": "--start refines one pose; leave --hypotheses out",
+    **{
+        f"{name} alone": f"--{name}: several processes share several photographs; leave it out for "
+        "one result"
+        for name in ("scheduler", "jobs")
+    },
+    "every !videos": "--every applies to the frames of videos; leave it out",
+    "start box|mask|listed|meshes": "--start refines one mesh in one photograph; leave --box, "
+    "--mask and --list out",
+    "listed box|mask|matrix": "the list holds boxes, masks and cameras; leave --box, --mask and "
+    "--camera out",
+    "views guess|prior": "the rig holds the cameras, and a rig takes no pose prior; leave --fov, "
+    "--azimuth, ... out",
+    "start_convention !start": "--start-convention: of the pose of --start; give it too",
+    "start prior": "--start: refines this pose alone; leave the pose prior out",
+    "distance !listed !camera !guess similar": f"--distance: {NO_CAMERA}",
+    "start|mask !one": "--start and --mask are of one photograph; give several masks in a list, "
+    "column mask",
+    "stamp !ros": "--stamp: of the messages of --format ros; give it too",
+    "frame !ros": "--frame: of the messages of --format ros; give it too",
+    "need !strict": "--need says what --strict asks for; give it too",
+    "format list": "--format {format}: of one result, in --out DIR",
+    "format !out": "--format {format}: of one result, in --out DIR",
+    "tracker views": "--format {format}: a tracker starts in one camera, not in a rig's world",
+    "format !views !camera !guess similar": f"--format {{format}}: {NO_CAMERA}",
+}
+"""Options that conflict, see :func:`.options.conflict`, and what is said about them."""
+
+
 def complete(arguments: argparse.Namespace) -> str | None:
     """Divide ``paths`` into ``photos`` and ``meshes``; returns what is wrong with the options
     together, or None."""
     rig = arguments.views
-    listed = arguments.list is not None or arguments.views is not None
-    limits = [name for name in PRIOR_OPTIONS if getattr(arguments, name) is not None]
+    listed = arguments.list is not None or rig is not None
     arguments.photos = [] if listed else arguments.paths if arguments.mesh else arguments.paths[:-1]
     arguments.meshes = [*arguments.paths[len(arguments.photos) :], *arguments.mesh]
     if arguments.unit is None and rig is not None and (rig / "scene_camera.json").is_file():
@@ -168,65 +207,29 @@ def complete(arguments: argparse.Namespace) -> str | None:
             f"{' '.join(numbers)}: numbers where a file is expected; --box and --camera take "
             f"four, --distance two"
         )
-    if not listed and not (arguments.photos and arguments.meshes):
-        return "expected PHOTO MESH, PHOTO ... --mesh MESH, or --list FILE MESH"
-    if arguments.out is None and not arguments.json:
-        return "expected --out DIR, or --json"
-    if rig is not None and (arguments.list or arguments.start or not arguments.meshes):
-        return "--views takes one or several meshes, and neither --list nor --start"
     if listed and len(arguments.paths) > 1:
         return (
-            f"with --list or --views, expected at most one MESH, got {len(arguments.paths)}; "
-            f"give "
+            f"with --list or --views, expected at most one MESH, got {len(arguments.paths)}; give "
             f"several by --mesh"
         )
-    if (arguments.box or arguments.boxes or arguments.mask) and arguments.instances is not None:
-        return "--instances applies only without a box; leave --box and --mask out"
-    if arguments.instances is not None and (arguments.start or rig is not None):
-        return "--start and --views are of one object; leave --instances out"
-    if arguments.hypotheses is not None and arguments.start:
-        return "--start refines one pose; leave --hypotheses out"
-    alone = rig is not None or (not listed and is_one_photograph(arguments.photos))
-    if alone and (arguments.jobs > 1 or arguments.scheduler is not None):
-        given = "--jobs" if arguments.scheduler is None else "--scheduler"
-        return f"{given}: several processes share several photographs; leave it out for one result"
-    if arguments.every > 1 and not any(
-        photo.suffix.lower() in VIDEOS for photo in arguments.photos
-    ):
-        return "--every applies to the frames of videos; leave it out"
-    if arguments.start is not None and (
-        arguments.box or arguments.mask or listed or len(arguments.meshes) > 1
-    ):
-        return "--start refines one mesh in one photograph; leave --box, --mask and --list out"
-    if listed and (arguments.box or arguments.mask or arguments.camera not in (None, "exif")):
-        return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
-    if rig is not None and (arguments.guess is not None or limits):
-        return (
-            "the rig holds the cameras, and a rig takes no pose prior; leave --fov, "
-            "--azimuth, ... out"
-        )
-    if arguments.start_convention is not None and arguments.start is None:
-        return "--start-convention: of the pose of --start; give it too"
-    if arguments.start is not None and limits:
-        return "--start: refines this pose alone; leave the pose prior out"
-    without_camera = arguments.camera is arguments.guess is None and arguments.mesh_is == "similar"
-    if "distance" in limits and not listed and without_camera:
-        return f"--distance: needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
-    if (arguments.start or arguments.mask) and not is_one_photograph(arguments.photos):
-        return "--start and --mask are of one photograph; give several masks in a list, column mask"
-    for name in ("stamp", "frame"):
-        if getattr(arguments, name) is not None and arguments.format != "ros":
-            return f"--{name}: of the messages of --format ros; give it too"
-    if arguments.need and not arguments.strict:
-        return "--need says what --strict asks for; give it too"
-    if arguments.format and (arguments.list or arguments.out is None):
-        return f"--format {arguments.format}: of one result, in --out DIR"
-    if arguments.format in TRACKERS and rig is not None:
-        return f"--format {arguments.format}: a tracker starts in one camera, not in a rig's world"
-    if arguments.format and rig is None and without_camera:
-        wanted = f"needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
-        return f"--format {arguments.format}: {wanted}"
-    return None
+    is_one = is_one_photograph(arguments.photos)
+    facts = {
+        "listed": listed,
+        "missing": not listed and not (arguments.photos and arguments.meshes),
+        "one": is_one,
+        "alone": rig is not None or (not listed and is_one),
+        "videos": any(photo.suffix.lower() in VIDEOS for photo in arguments.photos),
+        "no_mesh": not arguments.meshes,
+        "meshes": len(arguments.meshes) > 1,
+        "matrix": arguments.camera not in (None, "exif"),
+        "prior": any(getattr(arguments, name) is not None for name in PRIOR_OPTIONS),
+        "similar": arguments.mesh_is == "similar",
+        "tracker": arguments.format in TRACKERS,
+        "ros": arguments.format == "ros",
+    }
+    given = given_options(arguments) - facts.keys() | {name for name in facts if facts[name]}
+    problem = conflict(CONFLICTS, given)
+    return problem and problem.format(format=arguments.format)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -409,10 +412,9 @@ def _write_pose(
     from ..formats.exports.ros import write_ros
 
     if arguments.format in TRACKERS:
-        from ..jobs import trackers
+        from ..jobs.trackers import write_start
 
-        write = trackers.write_m3t if arguments.format == "m3t" else trackers.write_visp
-        write(arguments.out, registrar.bank.mesh, document)
+        write_start(arguments.format, arguments.out, registrar.bank.mesh, document)
     elif arguments.format:
         mesh = Path(document.get("mesh") or arguments.meshes[0])
         chosen = {name: getattr(arguments, name) for name in ("stamp", "frame")}

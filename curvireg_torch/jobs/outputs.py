@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError, OutputError
-from ..formats.exports import ros
+from ..formats.exports import ros, trackers
 from ..utils.files import check_writable, read_json, write_file
 
 try:
@@ -26,14 +26,7 @@ except ImportError:  # no locks on Windows
 
 MARKER = ".curvireg.json"
 
-M3T_FILES = ("object.obj", "object.yaml", "object_detector.yaml")
-"""The mesh in its own unit, M3T's body and its static detector, whose world is the camera."""
-
-VISP_FILES = ("object.cao", "object.init", "object.pos")
-"""The mesh, points of it with the pixels where they are (``initFromPoints``), and the pose
-(``initFromPose``)."""
-
-FOR_TOOLS = (*ros.FILES, *M3T_FILES, *VISP_FILES)
+FOR_TOOLS = (*ros.FILES, *trackers.M3T_FILES, *trackers.VISP_FILES)
 ONE_RESULT = ("result.json", "overlay.png", "pose.glb", *FOR_TOOLS)
 RESUMED = ("results.jsonl", "thumbnails")
 ROWS = (*RESUMED, "index.html")

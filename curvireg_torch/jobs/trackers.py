@@ -1,168 +1,34 @@
-"""A start pose and the mesh as other trackers read them: M3T (and pym3t), and ViSP; in metres."""
+"""A start pose and the mesh, as other trackers read them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
-import torch
 import trimesh
 
-from ..errors import InvalidInputError
-from ..geometry.conversions import axis_angle_from_rotation
+from ..formats.exports.trackers import write_m3t, write_visp
 from ..mesh.edges import encloses_volumes, simplified
 from ..mesh.mesh import mesh_centre
-from ..utils.choices import UNITS
-from ..utils.files import write_file
 
 MAX_CAO_FACES = 2000
 """Triangles to which larger meshes are simplified for ViSP, which follows the edges of each
 polygon."""
 
-INIT_POINTS = 12
-FLAT_ANGLE = 1e-3  # radians between triangles that are one polygon
 
-
-def write_m3t(out: Path, mesh: trimesh.Trimesh, document: Mapping[str, Any]) -> None:
-    """Write :data:`.outputs.M3T_FILES` into the folder ``out``.
-
-    Args:
-        out: the folder.
-        mesh: of :func:`curvireg_torch.load_mesh`, whose pose it is.
-        document: the content of ``result.json``.
+def write_start(
+    tracker: Literal["m3t", "visp"], out: Path, mesh: trimesh.Trimesh, document: Mapping[str, Any]
+) -> None:
+    """Write the files of M3T or ViSP into the folder ``out``; ``document`` is the content of
+    ``result.json``, of a pose of ``mesh``.
 
     Raises:
-        InvalidInputError: the pose has no translation.
+        InvalidInputError: the pose has no translation, or is in the world of several cameras.
         OutputError: a file cannot be written.
     """
-    T, metres = _pose_in_metres(document, "m3t")
-    vertices = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(mesh.vertices)]
-    faces = [f"f {a} {b} {c}" for a, b, c in np.asarray(mesh.faces) + 1]
-    write_file(out / "object.obj", "\n".join([*vertices, *faces, ""]).encode())
-    culls = int(encloses_volumes(mesh))  # an open surface is seen from both sides
-    body = [
-        "%YAML:1.2",
-        'geometry_path: "object.obj"',
-        f"geometry_unit_in_meter: {metres:.9g}",
-        "geometry_counterclockwise: 1",
-        f"geometry_enable_culling: {culls}",
-        f"geometry2body_pose: {_opencv_matrix(np.eye(4))}",
-        "",
-    ]
-    write_file(out / "object.yaml", "\n".join(body).encode())
-    detector = ["%YAML:1.2", f"link2world_pose: {_opencv_matrix(T)}", ""]
-    write_file(out / "object_detector.yaml", "\n".join(detector).encode())
-
-
-def _opencv_matrix(T: np.ndarray) -> str:
-    """(4, 4) in the YAML of OpenCV."""
-    numbers = ", ".join(f"{x:.12g}" for x in T.ravel())
-    return f"!!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: d\n  data: [{numbers}]"
-
-
-def write_visp(out: Path, mesh: trimesh.Trimesh, document: Mapping[str, Any]) -> None:
-    """Write :data:`.outputs.VISP_FILES` into the folder ``out``; arguments and errors are those of
-    :func:`write_m3t`. A mesh of more than ``MAX_CAO_FACES`` faces is simplified, and coplanar
-    triangles are one polygon."""
-    T, metres = _pose_in_metres(document, "visp")
-    centre = mesh_centre(mesh).numpy()
-    vertices, faces = simplified(mesh, centre, MAX_CAO_FACES)
-    points = metres * (vertices + centre)
-    polygons = polygons_of(trimesh.Trimesh(points, faces, process=False))
-    cao = [
-        "V1",
-        "# 3D points, in metres",
-        str(len(points)),
-        *(f"{x:.9g} {y:.9g} {z:.9g}" for x, y, z in points),
-        "# 3D lines",
-        "0",
-        "# Faces from 3D lines",
-        "0",
-        "# Faces from 3D points: their number, and their indices",
-        str(len(polygons)),
-        *(" ".join(map(str, (len(polygon), *polygon))) for polygon in polygons),
-        "# 3D cylinders",
-        "0",
-        "# 3D circles",
-        "0",
-        "",
-    ]
-    write_file(out / "object.cao", "\n".join(cao).encode())
-    some = points[_spread(points, INIT_POINTS)]
-    init = [
-        "# 3D points, in metres",
-        str(len(some)),
-        *(f"{x:.9g} {y:.9g} {z:.9g}" for x, y, z in some),
-        "# 2D points: row and column, in pixels",
-        str(len(some)),
-        *(f"{v:.6f} {u:.6f}" for u, v in _pixels(some, T, document["camera"]["matrix"])),
-        "",
-    ]
-    write_file(out / "object.init", "\n".join(init).encode())
-    axis_angle = axis_angle_from_rotation(torch.from_numpy(T[None, :3, :3].copy()))[0]
-    numbers = [*T[:3, 3].tolist(), *axis_angle.tolist()]
-    write_file(out / "object.pos", "".join(f"{x:.12g}\n" for x in numbers).encode())
-
-
-def _pose_in_metres(document: Mapping[str, Any], name: str) -> tuple[np.ndarray, float]:
-    """(4, 4) of the pose in the camera, and the length of the mesh's unit in metres."""
-    if document["translation"] is None:
-        raise InvalidInputError(f"--format {name}: a pose without translation; give a camera")
-    if document["frame"] == "world":
-        raise InvalidInputError(
-            f"--format {name}: a tracker starts in one camera; register one photograph"
-        )
-    metres = UNITS[document["unit"] or "m"]
-    T = np.eye(4)
-    T[:3, :3] = document["rotation"]
-    T[:3, 3] = metres * np.array(document["translation"])
-    return T, metres
-
-
-def _pixels(points: np.ndarray, T: np.ndarray, K: Sequence[Sequence[float]]) -> np.ndarray:
-    """(N, 2) pixels of points (N, 3)."""
-    seen = (points @ T[:3, :3].T + T[:3, 3]) @ np.array(K).T
-    pixels: np.ndarray = seen[:, :2] / seen[:, 2:]
-    return pixels
-
-
-def _spread(points: np.ndarray, count: int) -> list[int]:
-    """Indices of at most ``count`` points (N, 3), each as far as possible from those before it."""
-    chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
-    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < min(count, len(points)) and nearest.max() > 0:
-        chosen.append(int(nearest.argmax()))
-        distance = np.linalg.norm(points - points[chosen[-1]], axis=1)
-        nearest = np.minimum(nearest, distance)
-    return chosen
-
-
-def polygons_of(mesh: trimesh.Trimesh) -> list[list[int]]:
-    """Corners of the polygons of a mesh, counter-clockwise from outside: triangles in one plane are
-    one polygon, unless it would have holes."""
-    angles = mesh.face_adjacency_angles
-    flat = mesh.face_adjacency[angles < FLAT_ANGLE]
-    label = trimesh.graph.connected_component_labels(flat, node_count=len(mesh.faces))
-    polygons: list[list[int]] = []
-    for number in np.unique(label):
-        faces = mesh.faces[label == number]
-        outline = _outline(faces)
-        polygons += faces.tolist() if outline is None else [outline]
-    return polygons
-
-
-def _outline(faces: np.ndarray) -> list[int] | None:
-    """The corners around triangles (F, 3) in their order; None if that is no single loop."""
-    edges = {
-        (int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)
-    }
-    border = {a: b for a, b in edges if (b, a) not in edges}
-    if len(border) != sum((b, a) not in edges for a, b in edges) or not border:
-        return None
-    first = next(iter(border))
-    corners = [first]
-    while (corner := border.get(corners[-1], first)) != first:
-        corners.append(corner)
-        if len(corners) > len(border):
-            return None
-    return corners if len(corners) == len(border) else None
+    if tracker == "m3t":
+        closed = encloses_volumes(mesh)
+        write_m3t(out, mesh.vertices, mesh.faces, document, is_closed=closed)
+    else:
+        centre = mesh_centre(mesh).numpy()
+        vertices, faces = simplified(mesh, centre, MAX_CAO_FACES)
+        write_visp(out, vertices + centre, faces, document)

@@ -5,9 +5,11 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.jobs.trackers import polygons_of, write_m3t, write_visp
+from curvireg_torch.formats.exports.trackers import polygons_of
+from curvireg_torch.jobs.trackers import write_start
 from curvireg_torch.mesh import load_mesh
 
 ANGLE = np.array([0.3, -0.5, 0.2])
@@ -15,6 +17,7 @@ TRANSLATION = [30.0, -20.0, 900.0]
 K = [[800.0, 0.0, 319.5], [0.0, 790.0, 239.5], [0.0, 0.0, 1.0]]
 DOCUMENT = {
     "rotation": cv2.Rodrigues(ANGLE)[0].tolist(),
+    "quaternion": Rotation.from_rotvec(ANGLE).as_quat(scalar_first=True).tolist(),
     "translation": TRANSLATION,
     "unit": "mm",
     "frame": "camera",
@@ -54,7 +57,7 @@ def read_cao(path):
 
 
 def test_m3t_reads_the_pose_in_metres_and_the_mesh_in_its_unit(tmp_path):
-    write_m3t(tmp_path, box(), DOCUMENT)
+    write_start("m3t", tmp_path, box(), DOCUMENT)
     detector = cv2.FileStorage(str(tmp_path / "object_detector.yaml"), cv2.FILE_STORAGE_READ)
     T = detector.getNode("link2world_pose").mat()
     np.testing.assert_allclose(T[:3, :3], DOCUMENT["rotation"], atol=1e-9)
@@ -73,13 +76,13 @@ def test_m3t_reads_the_pose_in_metres_and_the_mesh_in_its_unit(tmp_path):
 def test_m3t_shows_both_sides_of_an_open_surface(tmp_path):
     mesh = box()
     mesh.update_faces(np.arange(10))
-    write_m3t(tmp_path, mesh, DOCUMENT)
+    write_start("m3t", tmp_path, mesh, DOCUMENT)
     body = cv2.FileStorage(str(tmp_path / "object.yaml"), cv2.FILE_STORAGE_READ)
     assert body.getNode("geometry_enable_culling").real() == 0
 
 
 def test_visp_reads_polygons_counter_clockwise_from_outside(tmp_path):
-    write_visp(tmp_path, box(), DOCUMENT)
+    write_start("visp", tmp_path, box(), DOCUMENT)
     vertices, polygons = read_cao(tmp_path / "object.cao")
     np.testing.assert_allclose(vertices.min(axis=0), [-0.05, -0.035, -0.02])
     np.testing.assert_allclose(vertices.max(axis=0), [0.07, 0.045, 0.02])
@@ -91,7 +94,7 @@ def test_visp_reads_polygons_counter_clockwise_from_outside(tmp_path):
 
 
 def test_visp_finds_the_pose_from_points_and_reads_it(tmp_path):
-    write_visp(tmp_path, box(), DOCUMENT)
+    write_start("visp", tmp_path, box(), DOCUMENT)
     words = numbers(tmp_path / "object.init")
     count = int(next(words))
     model = points(words, count, 3)
@@ -103,13 +106,18 @@ def test_visp_finds_the_pose_from_points_and_reads_it(tmp_path):
     assert found
     np.testing.assert_allclose(angle[:, 0], ANGLE, atol=1e-4)
     np.testing.assert_allclose(translation[:, 0], [0.03, -0.02, 0.9], atol=1e-4)
-    pose = [float(x) for x in (tmp_path / "object.pos").read_text().split()]
-    np.testing.assert_allclose(pose, [0.03, -0.02, 0.9, *ANGLE], atol=1e-9)
+    quaternion = np.array(DOCUMENT["quaternion"])
+    for same in (quaternion, -quaternion):
+        write_start("visp", tmp_path, box(), {**DOCUMENT, "quaternion": same.tolist()})
+        pose = [float(x) for x in (tmp_path / "object.pos").read_text().split()]
+        np.testing.assert_allclose(pose, [0.03, -0.02, 0.9, *ANGLE], atol=1e-9)
+    write_start("visp", tmp_path, box(), {**DOCUMENT, "quaternion": [-1.0, 0.0, 0.0, 0.0]})
+    assert [float(x) for x in (tmp_path / "object.pos").read_text().split()[3:]] == [0.0] * 3
 
 
 def test_visp_gets_few_faces_and_points_of_a_large_mesh(tmp_path):
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=50.0)
-    write_visp(tmp_path, mesh, DOCUMENT)
+    write_start("visp", tmp_path, mesh, DOCUMENT)
     vertices, polygons = read_cao(tmp_path / "object.cao")
     assert 500 < len(polygons) <= 2000
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, rtol=0.02)
@@ -125,12 +133,12 @@ def test_a_face_with_a_hole_stays_triangles():
     assert sorted(polygons_of(mesh)) == sorted(faces)
 
 
-@pytest.mark.parametrize("write", [write_m3t, write_visp])
+@pytest.mark.parametrize("tracker", ["m3t", "visp"])
 @pytest.mark.parametrize(
     ("changes", "message"),
     [({"translation": None}, "give a camera"), ({"frame": "world"}, "one camera")],
 )
-def test_poses_that_no_tracker_can_start_from_are_refused(tmp_path, write, changes, message):
+def test_poses_that_no_tracker_can_start_from_are_refused(tmp_path, tracker, changes, message):
     with pytest.raises(InvalidInputError, match=message):
-        write(tmp_path, box(), {**DOCUMENT, **changes})
+        write_start(tracker, tmp_path, box(), {**DOCUMENT, **changes})
     assert not [*tmp_path.iterdir()]

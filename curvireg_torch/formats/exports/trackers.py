@@ -1,0 +1,182 @@
+"""A start pose and the mesh as other trackers read them: M3T (and pym3t), and ViSP; in metres."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from ...errors import InvalidInputError
+from ...utils.choices import UNITS
+from ...utils.files import write_file
+
+M3T_FILES = ("object.obj", "object.yaml", "object_detector.yaml")
+"""The mesh in its own unit, M3T's body and its static detector, whose world is the camera."""
+
+VISP_FILES = ("object.cao", "object.init", "object.pos")
+"""The mesh, points of it with the pixels where they are (``initFromPoints``), and the pose
+(``initFromPose``)."""
+
+INIT_POINTS = 12
+FLAT_ANGLE = 1e-3  # radians between triangles that are one polygon
+
+
+def write_m3t(
+    out: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    document: Mapping[str, Any],
+    *,
+    is_closed: bool,
+) -> None:
+    """Write the ``M3T_FILES`` into the folder ``out``.
+
+    Args:
+        out: the folder.
+        vertices: (V, 3) of the mesh whose pose it is, in its unit.
+        faces: (F, 3), counter-clockwise from outside.
+        document: the content of ``result.json``.
+        is_closed: whether the back sides of the faces are never seen.
+
+    Raises:
+        InvalidInputError: the pose has no translation.
+        OutputError: a file cannot be written.
+    """
+    T, metres = _pose_in_metres(document, "m3t")
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
+    lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    write_file(out / "object.obj", "\n".join([*lines, ""]).encode())
+    body = [
+        "%YAML:1.2",
+        'geometry_path: "object.obj"',
+        f"geometry_unit_in_meter: {metres:.9g}",
+        "geometry_counterclockwise: 1",
+        f"geometry_enable_culling: {int(is_closed)}",
+        f"geometry2body_pose: {_opencv_matrix(np.eye(4))}",
+        "",
+    ]
+    write_file(out / "object.yaml", "\n".join(body).encode())
+    detector = ["%YAML:1.2", f"link2world_pose: {_opencv_matrix(T)}", ""]
+    write_file(out / "object_detector.yaml", "\n".join(detector).encode())
+
+
+def _opencv_matrix(T: np.ndarray) -> str:
+    """(4, 4) in the YAML of OpenCV."""
+    numbers = ", ".join(f"{x:.12g}" for x in T.ravel())
+    return f"!!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: d\n  data: [{numbers}]"
+
+
+def write_visp(
+    out: Path, vertices: np.ndarray, faces: np.ndarray, document: Mapping[str, Any]
+) -> None:
+    """Write the ``VISP_FILES`` into the folder ``out``; arguments and errors are those of
+    :func:`write_m3t`. Coplanar triangles are one polygon."""
+    T, metres = _pose_in_metres(document, "visp")
+    points = metres * vertices
+    polygons = polygons_of(trimesh.Trimesh(points, faces, process=False))
+    cao = [
+        "V1",
+        "# 3D points, in metres",
+        str(len(points)),
+        *(f"{x:.9g} {y:.9g} {z:.9g}" for x, y, z in points),
+        "# 3D lines",
+        "0",
+        "# Faces from 3D lines",
+        "0",
+        "# Faces from 3D points: their number, and their indices",
+        str(len(polygons)),
+        *(" ".join(map(str, (len(polygon), *polygon))) for polygon in polygons),
+        "# 3D cylinders",
+        "0",
+        "# 3D circles",
+        "0",
+        "",
+    ]
+    write_file(out / "object.cao", "\n".join(cao).encode())
+    some = points[_spread(points, INIT_POINTS)]
+    init = [
+        "# 3D points, in metres",
+        str(len(some)),
+        *(f"{x:.9g} {y:.9g} {z:.9g}" for x, y, z in some),
+        "# 2D points: row and column, in pixels",
+        str(len(some)),
+        *(f"{v:.6f} {u:.6f}" for u, v in _pixels(some, T, document["camera"]["matrix"])),
+        "",
+    ]
+    write_file(out / "object.init", "\n".join(init).encode())
+    numbers = [*T[:3, 3], *_axis_angle(document["quaternion"])]
+    write_file(out / "object.pos", "".join(f"{x:.12g}\n" for x in numbers).encode())
+
+
+def _pose_in_metres(document: Mapping[str, Any], name: str) -> tuple[np.ndarray, float]:
+    """(4, 4) of the pose in the camera, and the length of the mesh's unit in metres."""
+    if document["translation"] is None:
+        raise InvalidInputError(f"--format {name}: a pose without translation; give a camera")
+    if document["frame"] == "world":
+        raise InvalidInputError(
+            f"--format {name}: a tracker starts in one camera; register one photograph"
+        )
+    metres = UNITS[document["unit"] or "m"]
+    T = np.eye(4)
+    T[:3, :3] = document["rotation"]
+    T[:3, 3] = metres * np.array(document["translation"])
+    return T, metres
+
+
+def _axis_angle(quaternion: Sequence[float]) -> np.ndarray:
+    """(3,) axis x angle, the angle in radians, at most pi, of w, x, y, z."""
+    w, *vector = quaternion
+    sine = math.hypot(*vector)
+    angle = 2.0 * math.atan2(sine, abs(w))
+    return np.array(vector) * math.copysign(angle, w) / max(sine, 1e-300)
+
+
+def _pixels(points: np.ndarray, T: np.ndarray, K: Sequence[Sequence[float]]) -> np.ndarray:
+    """(N, 2) pixels of points (N, 3)."""
+    seen = (points @ T[:3, :3].T + T[:3, 3]) @ np.array(K).T
+    pixels: np.ndarray = seen[:, :2] / seen[:, 2:]
+    return pixels
+
+
+def _spread(points: np.ndarray, count: int) -> list[int]:
+    """Indices of at most ``count`` points (N, 3), each as far as possible from those before it."""
+    chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
+    nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(points)) and nearest.max() > 0:
+        chosen.append(int(nearest.argmax()))
+        distance = np.linalg.norm(points - points[chosen[-1]], axis=1)
+        nearest = np.minimum(nearest, distance)
+    return chosen
+
+
+def polygons_of(mesh: trimesh.Trimesh) -> list[list[int]]:
+    """Corners of the polygons of a mesh, counter-clockwise from outside: triangles in one plane are
+    one polygon, unless it would have holes."""
+    angles = mesh.face_adjacency_angles
+    flat = mesh.face_adjacency[angles < FLAT_ANGLE]
+    label = trimesh.graph.connected_component_labels(flat, node_count=len(mesh.faces))
+    polygons: list[list[int]] = []
+    for number in np.unique(label):
+        faces = mesh.faces[label == number]
+        outline = _outline(faces)
+        polygons += faces.tolist() if outline is None else [outline]
+    return polygons
+
+
+def _outline(faces: np.ndarray) -> list[int] | None:
+    """The corners around triangles (F, 3) in their order; None if that is no single loop."""
+    edges = {
+        (int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)
+    }
+    border = {a: b for a, b in edges if (b, a) not in edges}
+    if len(border) != sum((b, a) not in edges for a, b in edges) or not border:
+        return None
+    first = next(iter(border))
+    corners = [first]
+    while (corner := border.get(corners[-1], first)) != first:
+        corners.append(corner)
+        if len(corners) > len(border):
+            return None
+    return corners if len(corners) == len(border) else None
