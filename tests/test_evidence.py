@@ -11,7 +11,7 @@ from curvireg_torch.evidence import RANK_ALONE, Evidence, EvidenceWeights
 NAMES = [field.name for field in fields(Evidence)]
 
 
-def evidence(count: int = 3, **columns: list[float]) -> Evidence:
+def evidence(count=3, **columns):
     values = {name: torch.tensor(column).double() for name, column in columns.items()}
     nothing = torch.zeros(count, dtype=torch.float64)
     return Evidence(**{name: values.get(name, nothing) for name in NAMES})

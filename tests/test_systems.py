@@ -12,7 +12,6 @@ from pathlib import Path, PureWindowsPath
 import pytest
 import torch
 
-from curvireg_torch import Registrar
 from curvireg_torch.data.cameras import load_camera
 from curvireg_torch.formats.boxes import BoxFile, PictureSize
 from curvireg_torch.formats.masks import mask_file
@@ -26,7 +25,7 @@ UNIX_NAMES = {"fork", "forkpty", "getuid", "geteuid", "chown", "mkfifo", "setsid
 SOURCES = sorted([*ROOT.glob("curvireg_torch/**/*.py"), *ROOT.glob("scripts/**/*.py")])
 
 
-def on_import(tree: ast.Module) -> list[ast.stmt]:
+def on_import(tree):
     """Statements that an import runs, and does not catch; not those of functions."""
     waiting = list(tree.body)
     found = []
@@ -44,7 +43,7 @@ def on_import(tree: ast.Module) -> list[ast.stmt]:
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_no_module_needs_what_only_unix_has(source: Path) -> None:
+def test_no_module_needs_what_only_unix_has(source):
     tree = ast.parse(source.read_text(encoding="utf-8"))
     for statement in on_import(tree):
         names = []
@@ -82,7 +81,7 @@ sys.exit(main(["cache"]))
 
 
 @pytest.mark.slow
-def test_the_package_runs_without_the_modules_of_unix(tmp_path: Path) -> None:
+def test_the_package_runs_without_the_modules_of_unix(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "CURVIREG_CACHE": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_UNIX],
@@ -95,7 +94,7 @@ def test_the_package_runs_without_the_modules_of_unix(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def registered(registrar: Registrar) -> list[float]:
+def registered(registrar):
     """The pose in a generated photograph; a function that a spawned process can find."""
     torch.set_num_threads(1)
     image, box, _ = scene(0)
@@ -104,7 +103,7 @@ def registered(registrar: Registrar) -> list[float]:
 
 
 @pytest.mark.slow
-def test_a_spawned_process_gives_the_same_pose() -> None:
+def test_a_spawned_process_gives_the_same_pose():
     """As on Windows and macOS, nothing is inherited: the registrar is sent."""
     registrar = truck_registrar()
     expected = registered(pickle.loads(pickle.dumps(registrar)))
@@ -114,9 +113,7 @@ def test_a_spawned_process_gives_the_same_pose() -> None:
 
 
 @pytest.mark.parametrize("name", ["C:\\shots\\boxes.json", "D:/shots/boxes.json"])
-def test_drives_are_no_names_within_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_drives_are_no_names_within_files(tmp_path, monkeypatch, name):
     """FILE:NAME of a path with a drive; there is a file of this name, as there can be here too."""
     monkeypatch.chdir(tmp_path)
     file = Path(name)
@@ -149,7 +146,7 @@ def test_drives_are_no_names_within_files(
         "art\\..\\..\\print.png",
     ],
 )
-def test_textures_with_backslashes_stay_in_the_folder(tmp_path: Path, name: str) -> None:
+def test_textures_with_backslashes_stay_in_the_folder(tmp_path, name):
     """By the rules of Windows these lead out of the folder; of absolute ones the last part
     counts."""
     folder = tmp_path / "in"

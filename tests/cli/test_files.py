@@ -18,7 +18,7 @@ import pytest
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.formats.exports import ros
+from curvireg_torch.formats.exports import ros, trackers
 from curvireg_torch.jobs import outputs
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.visualization import sheet
@@ -78,7 +78,7 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names & {"pose.glb", *ros.FILES} >= {"pose.yaml", "tf.yaml"}
     assert "pose.glb" not in names
-    for tool, files in (("m3t", outputs.M3T_FILES), ("visp", outputs.VISP_FILES)):
+    for tool, files in (("m3t", trackers.M3T_FILES), ("visp", trackers.VISP_FILES)):
         assert register(*words, "--format", tool) == 0
         names = {path.name for path in (tmp_path / "out").iterdir()}
         assert names & {*outputs.FOR_TOOLS} == {*files}
@@ -86,67 +86,51 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     assert not {"pose.glb", *ros.FILES} & {path.name for path in (tmp_path / "out").iterdir()}
 
 
+# Runs the command line with a command that prints text and imports nothing large
+PRINTING = """
+import sys
+from curvireg_torch import __main__
+from curvireg_torch.cli import commands
+commands.show_cache = lambda arguments: print("x" * {count})
+sys.exit(__main__.start())
+"""
+
+
+def ended(words, unbuffered, count=1, **files):
+    """A process of the command line; the command ``cache`` prints so many letters."""
+    return subprocess.run(
+        [sys.executable, "-c", PRINTING.format(count=count), *words],
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+        timeout=120,
+        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        **files,
+    )
+
+
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_main_ends_silently_when_the_reader_of_a_pipe_has_gone(unbuffered):
     """As in ``curvireg ... | head``: no message, and the exit code of shell tools."""
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "curvireg_torch", "cache"]
-    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
-    done = subprocess.run(
-        command, stdout=writer, stderr=subprocess.PIPE, env=environment, check=False, timeout=120
-    )
+    done = ended(["cache"], unbuffered, stdout=writer)
     os.close(writer)
-    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("words", [["cache"], ["--version"], ["register", "--help"]])
-def test_output_that_cannot_be_written_is_a_line_and_a_code(words, unbuffered):
-    """The disk is full; the help is longer than the buffer of standard output."""
-    if not Path("/dev/full").exists():
-        pytest.skip("this system has no /dev/full")
-    command = [sys.executable, "-m", "curvireg_torch", *words]
-    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
-    with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            command,
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-            timeout=120,
-            env=environment,
-        )
-    line = done.stderr.splitlines()[-1]
-    assert line.startswith("curvireg: error: standard output: cannot be written (No space left")
-    assert "Traceback" not in done.stderr
-    assert done.returncode == 2
-
-
-PRINT_MUCH = """
-import sys
-from curvireg_torch.cli import commands, main
-commands.show_cache = lambda arguments: print("x" * 100_000)
-sys.exit(main(["cache"]))
-"""
-
-
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_long_result_that_cannot_be_written_is_a_line_and_a_code(unbuffered):
-    """What does not fit into the buffer of standard output fails while the command runs."""
+@pytest.mark.parametrize(
+    ("words", "count"),
+    [(["cache"], 1), (["cache"], 100_000), (["--version"], 0), (["register", "--help"], 0)],
+)
+def test_output_that_cannot_be_written_is_a_line_and_a_code(words, count, unbuffered):
+    """The disk is full; what does not fit into the buffer of standard output, as the help, fails
+    while the command runs."""
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")
     with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [sys.executable, "-c", PRINT_MUCH],
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-            timeout=120,
-            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
-        )
+        done = ended(words, unbuffered, count, stdout=full)
     (line,) = done.stderr.splitlines()
     assert line.startswith("curvireg: error: standard output: cannot be written (No space left")
     assert done.returncode == 2
@@ -156,10 +140,8 @@ def test_a_long_result_that_cannot_be_written_is_a_line_and_a_code(unbuffered):
 @pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
 def test_a_command_runs_without_standard_output_and_error(closed):
     """As under some services."""
-    command = f'"$0" -m curvireg_torch cache {closed}'
-    done = subprocess.run(
-        ["sh", "-c", command, sys.executable], capture_output=True, check=False, timeout=120
-    )
+    command = ["sh", "-c", f'"$0" -c "$1" cache {closed}', sys.executable, PRINTING.format(count=1)]
+    done = subprocess.run(command, capture_output=True, check=False, timeout=120)
     assert (done.returncode, done.stderr) == (0, b"")
 
 

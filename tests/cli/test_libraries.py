@@ -23,7 +23,13 @@ print(len(trimesh.creation.box().vertex_adjacency_graph))
     assert done.stdout.split() == ["True", "True", "0", "8"]
 
 
-@pytest.mark.parametrize("module", ["numpy.exceptions", "torch._C", "trimesh"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "numpy.exceptions",
+        *(pytest.param(m, marks=pytest.mark.slow) for m in ("torch._C", "trimesh")),
+    ],
+)
 def test_ctrl_c_while_libraries_are_loaded_interrupts_the_command(module: str) -> None:
     """Not each library survives an exception in its import: numpy recurses without end."""
     code = f"""
@@ -54,7 +60,7 @@ import os
 from curvireg_torch.cli.libraries import load_libraries
 load_libraries()
 import numpy as np
-matrix = np.ones((2000, 2000))
+matrix = np.ones((600, 600))
 matrix @ matrix
 print(len(os.listdir("/proc/self/task")))
 """

@@ -77,6 +77,7 @@ def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, capsys):
     assert "frame_id: world" in (tmp_path / "pose.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_views_of_quaternions_and_calibration_files(rig, folder, tmp_path):
     place, rows = rig
     (place / "cameras.txt").write_text("1 PINHOLE 480 360 520 520 240 180\n")  # of twice the size

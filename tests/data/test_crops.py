@@ -3,7 +3,6 @@ that they wrap."""
 
 import math
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import torch
 from torch.utils.data import DataLoader, Subset
 
 import curvireg_torch as cr
-from curvireg_torch.data import BOPDataset, ObjectDataset, Pascal3DPlus, PoseFolder, crops
+from curvireg_torch.data import BOPDataset, Pascal3DPlus, PoseFolder, crops
 from curvireg_torch.data.crops import UNKNOWN_CLASS, _viewpoint_of, viewpoint_bins
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_viewpoint
@@ -20,7 +19,7 @@ from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 
 @pytest.fixture(params=["pascal", "bop", "web"])
-def dataset(request: pytest.FixtureRequest, tmp_path: Path) -> ObjectDataset:
+def dataset(request, tmp_path):
     write, make = {
         "pascal": (write_pascal3d, Pascal3DPlus),
         "bop": (write_bop, lambda root: BOPDataset(root, targets=False)),
@@ -31,7 +30,7 @@ def dataset(request: pytest.FixtureRequest, tmp_path: Path) -> ObjectDataset:
 
 
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_default_collate_takes_the_crops(dataset: ObjectDataset, workers: int) -> None:
+def test_default_collate_takes_the_crops(dataset, workers):
     cropped = cr.data.crops(dataset, 32)
     context = "spawn" if workers else None
     loader = DataLoader(cropped, len(cropped), num_workers=workers, multiprocessing_context=context)
@@ -47,7 +46,7 @@ def test_default_collate_takes_the_crops(dataset: ObjectDataset, workers: int) -
     assert float(batch["image"].max()) <= 1.0
 
 
-def test_crops_show_the_boxes_with_their_poses_and_classes(tmp_path: Path) -> None:
+def test_crops_show_the_boxes_with_their_poses_and_classes(tmp_path):
     write_pascal3d(tmp_path)
     dataset = Pascal3DPlus(tmp_path)
     cropped = crops(dataset, 24, margin=0.25, bins=(8, 6, 4))
@@ -65,8 +64,8 @@ def test_crops_show_the_boxes_with_their_poses_and_classes(tmp_path: Path) -> No
 
 
 def test_objects_of_bop_sets_are_classes_and_those_without_a_box_are_counted(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     write_bop(tmp_path)
     # One scene has no boxes: they are those of the mesh, if it can be read.
     tmp_path.joinpath("models", "obj_000001.ply").write_text("ply")
@@ -83,7 +82,7 @@ def test_objects_of_bop_sets_are_classes_and_those_without_a_box_are_counted(
     ]
 
 
-def test_numbers_of_objects_are_ordered_by_value(tmp_path: Path) -> None:
+def test_numbers_of_objects_are_ordered_by_value(tmp_path):
     write_bop(tmp_path)
     dataset = BOPDataset(tmp_path, targets=False)
     for item, number in zip(dataset._items, (10, 9, 100, 9), strict=False):
@@ -91,7 +90,7 @@ def test_numbers_of_objects_are_ordered_by_value(tmp_path: Path) -> None:
     assert crops(dataset, 16).classes == ["9", "10", "100"]
 
 
-def test_unknown_poses_have_no_bin(tmp_path: Path) -> None:
+def test_unknown_poses_have_no_bin(tmp_path):
     write_web(tmp_path)
     dataset = PoseFolder(tmp_path)
     known = [not bool(dataset.annotation(i)["rotation"].isnan().any()) for i in range(len(dataset))]
@@ -116,7 +115,7 @@ def test_unknown_poses_have_no_bin(tmp_path: Path) -> None:
         ((0.0, 90.0, 0.0), [0, 11, 12]),
     ],
 )
-def test_viewpoint_bins(viewpoint: tuple[float, float, float], expected: list[int]) -> None:
+def test_viewpoint_bins(viewpoint, expected):
     """Borders belong to the upper bin, whatever the rounding of the rotation."""
     assert viewpoint_bins(torch.tensor(viewpoint), (24, 12, 24)).tolist() == expected
     rotation = rotation_from_viewpoint(*viewpoint).float()  # as samples have it
@@ -126,7 +125,7 @@ def test_viewpoint_bins(viewpoint: tuple[float, float, float], expected: list[in
         )
 
 
-def test_crops_transform_and_split(tmp_path: Path) -> None:
+def test_crops_transform_and_split(tmp_path):
     write_pascal3d(tmp_path)
     dataset = Pascal3DPlus(tmp_path, transform=lambda image: 0.5 * image)
     plain = crops(Pascal3DPlus(tmp_path), 16)
@@ -139,7 +138,7 @@ def test_crops_transform_and_split(tmp_path: Path) -> None:
     assert len(pickle.loads(pickle.dumps(plain))) == len(plain)
 
 
-def test_crops_refuse_wrong_options(tmp_path: Path) -> None:
+def test_crops_refuse_wrong_options(tmp_path):
     write_pascal3d(tmp_path)
     dataset = Pascal3DPlus(tmp_path)
     for arguments, options, message in (
@@ -158,7 +157,7 @@ def test_crops_refuse_wrong_options(tmp_path: Path) -> None:
             crops(*arguments, **options)
 
 
-def test_datasets_transform_images_and_targets(dataset: ObjectDataset) -> None:
+def test_datasets_transform_images_and_targets(dataset):
     make = type(dataset)
     options = {"targets": False} if make is BOPDataset else {}
     changed = make(
@@ -181,7 +180,7 @@ def test_datasets_transform_images_and_targets(dataset: ObjectDataset) -> None:
     )
 
 
-def test_a_transform_of_image_and_labels_may_move_pixels(dataset: ObjectDataset) -> None:
+def test_a_transform_of_image_and_labels_may_move_pixels(dataset):
     """A transform of the image alone may not: box, camera and pose would not follow."""
     make = type(dataset)
     options = {"targets": False} if make is BOPDataset else {}
@@ -191,7 +190,7 @@ def test_a_transform_of_image_and_labels_may_move_pixels(dataset: ObjectDataset)
     with pytest.raises(InvalidInputError, match=rf"of a photograph \(3, {H}, {W}\).*transforms="):
         half[0]
 
-    def halve(image: torch.Tensor, sample: dict) -> tuple[torch.Tensor, dict]:
+    def halve(image, sample):
         return image[:, ::2, ::2], {**sample, "box": sample["box"] / 2}
 
     together = make(dataset.root, transform=lambda image: 1 - image, transforms=halve, **options)
@@ -203,7 +202,7 @@ def test_a_transform_of_image_and_labels_may_move_pixels(dataset: ObjectDataset)
         crops(together, 16)
 
 
-def test_datasets_say_what_they_are(dataset: ObjectDataset) -> None:
+def test_datasets_say_what_they_are(dataset):
     name = type(dataset).__name__
     split = {"Pascal3DPlus": ", split='val'", "BOPDataset": ", split='test'", "PoseFolder": ""}[
         name
@@ -211,7 +210,7 @@ def test_datasets_say_what_they_are(dataset: ObjectDataset) -> None:
     assert repr(dataset) == f"{name}(root={str(dataset.root)!r}{split}, {len(dataset)} objects)"
 
 
-def test_datasets_take_whole_numbers_only(dataset: ObjectDataset) -> None:
+def test_datasets_take_whole_numbers_only(dataset):
     count = len(dataset)
     assert dataset[np.int64(-1)]["image_path"] == dataset[count - 1]["image_path"]
     assert dataset.annotation(torch.tensor(0))["image_path"] == dataset[0]["image_path"]

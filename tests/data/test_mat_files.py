@@ -12,7 +12,7 @@ from tests._support.matlab import element, file
 from tests._support.miniature import pascal_object, write_record
 
 
-def array(array_class: int, dims: tuple[int, ...], rest: bytes, name: bytes = b"record") -> bytes:
+def array(array_class, dims, rest, name=b"record"):
     flags = struct.pack("<II", array_class, 0)
     sizes = struct.pack(f"<{len(dims)}i", *dims)
     return element(14, element(6, flags) + element(5, sizes) + element(1, name) + rest)
@@ -21,7 +21,7 @@ def array(array_class: int, dims: tuple[int, ...], rest: bytes, name: bytes = b"
 FIELD_A = element(5, struct.pack("<i", 8)) + element(1, b"a".ljust(8, b"\0"))  # one field, named a
 
 
-def nested(depth: int) -> bytes:
+def nested(depth):
     value = array(6, (1, 1), element(9, struct.pack("<d", 1.0)))
     for _ in range(depth):
         value = array(2, (1, 1), FIELD_A + value)

@@ -43,7 +43,7 @@ def test_pascal3d_projection_fills_the_labelled_box():
     )
     centre = []
     edges = []
-    for sample in map(dataset.annotation, range(len(dataset))):
+    for sample in map(dataset.annotation, range(0, len(dataset), 3)):
         box = projected_box(sample["cad_path"], sample)
         labelled = sample["box"]
         size = (labelled[2:] - labelled[:2]).max()

@@ -6,8 +6,6 @@ import inspect
 import json
 import re
 from importlib import import_module
-from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -22,18 +20,18 @@ PATHS = (
 GENERATED = r"<!-- ([\w ]+):begin -->.*?<!-- \1:end -->"
 
 
-def without_code(page: Path) -> str:
+def without_code(page):
     return re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
-def anchor(heading: str) -> str:
+def anchor(heading):
     """The anchor that GitHub and MyST derive from a heading."""
     text = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).strip().lower()
     return re.sub(r"[^\w\- ]", "", text.replace("`", "")).replace(" ", "-")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_links_resolve(page: Path) -> None:
+def test_links_resolve(page):
     for link in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", without_code(page))):
         if re.match(r"\w+:", link):
             continue
@@ -46,7 +44,7 @@ def test_links_resolve(page: Path) -> None:
         assert not name or name in map(anchor, headings), f"{link}: no such heading"
 
 
-def resolve(dotted: str) -> object:
+def resolve(dotted):
     """The object that ``curvireg_torch.a.b`` names; None if there is none."""
     names = dotted.split(".")
     # attributes first: a function may have the name of its module
@@ -63,7 +61,7 @@ def resolve(dotted: str) -> object:
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_dotted_names_and_paths_exist(source: Path) -> None:
+def test_dotted_names_and_paths_exist(source):
     text = source.read_text(encoding="utf-8")
     dotted = {
         f"curvireg_torch.{name}"
@@ -76,7 +74,7 @@ def test_dotted_names_and_paths_exist(source: Path) -> None:
     assert not [path for path in re.findall(PATHS, written_by_hand) if not (ROOT / path).is_file()]
 
 
-def test_reference_lists_every_public_name() -> None:
+def test_reference_lists_every_public_name():
     page = (DOCS / "api" / "index.md").read_text(encoding="utf-8")
     listed = re.findall(r"\{py:obj\}`(\w+) <([\w.]+)>`", page)
     public = {
@@ -89,7 +87,7 @@ def test_reference_lists_every_public_name() -> None:
         assert resolve(dotted) is getattr(curvireg_torch, name), dotted
 
 
-def module_of_docs(name: str) -> ModuleType:
+def module_of_docs(name):
     spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
@@ -108,7 +106,7 @@ def test_the_page_of_commands_is_current():
         assert f"| `{option}` |" in page
 
 
-def test_the_method_in_pictures_is_current() -> None:
+def test_the_method_in_pictures_is_current():
     """``python docs/make_pictures.py`` writes the page and its pictures."""
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     module = module_of_docs("make_pictures")
@@ -127,11 +125,11 @@ CHECK_SITE = module_of_docs("check_site")
 
 
 @pytest.mark.parametrize(("word", "page"), CHECK_SITE.SEARCHED.items())
-def test_what_people_search_for_is_on_its_page(word: str, page: str) -> None:
+def test_what_people_search_for_is_on_its_page(word, page):
     assert word in (DOCS / f"{page}.md").read_text(encoding="utf-8")
 
 
-def test_the_check_of_the_site_finds_faults(tmp_path: Path) -> None:
+def test_the_check_of_the_site_finds_faults(tmp_path):
     """Words that the index lacks, and what a browser would fetch; ``scripts/docs.sh`` runs it."""
     pytest.importorskip("sphinx", reason="Sphinx is not installed")
     pages = sorted(set(CHECK_SITE.SEARCHED.values()))
@@ -158,7 +156,7 @@ def test_the_check_of_the_site_finds_faults(tmp_path: Path) -> None:
     assert fault.endswith("https://cdn.org/a.js is fetched from elsewhere")
 
 
-def test_formulas_need_no_script() -> None:
+def test_formulas_need_no_script():
     pytest.importorskip("latex2mathml", reason="latex2mathml is not installed")
     formula = module_of_docs("mathml").formula(r"\sqrt{a < b}", display="inline")
     assert "<msqrt>" in formula

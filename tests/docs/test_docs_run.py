@@ -6,7 +6,6 @@ import re
 import runpy
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +43,20 @@ AZIMUTHS = {"photo.jpg": 30.0, "front.jpg": 210.0, "left.jpg": 300.0, "above.jpg
 FIRST_PAGES = (ROOT / "README.md", DOCS / "getting-started.md")
 SLOW = {
     DOCS / "evaluation.md",
-    *(DOCS / "guides" / name for name in ("several.md", "coming-from.md", "boxes.md")),
-}  # 30 s and more on one core
+    *(
+        DOCS / "guides" / f"{name}.md"
+        for name in (
+            *("several", "coming-from", "boxes", "without-a-box", "unit-and-up", "layers"),
+            *("ambiguous", "photographs", "several-photographs", "known-pose"),
+        )
+    ),
+}  # the others run some seconds
 
 
 PHOTO_CAMERA = cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0)
 
 
-def pose(azimuth: float) -> torch.Tensor:
+def pose(azimuth):
     """(4, 4) pose of the truck in m, whose box is about 410 220 890 700."""
     points = torch.from_numpy(example_mesh().vertices.copy())
     box = torch.tensor([410.0, 220.0, 890.0, 700.0])
@@ -62,7 +67,7 @@ def pose(azimuth: float) -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def files(tmp_path_factory):
     """A folder with a part in mm, photographs of it, and datasets."""
     folder = tmp_path_factory.mktemp("newcomer")
     mesh = example_mesh()
@@ -115,9 +120,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def in_folder(
-    files: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[None]:
+def in_folder(files, tmp_path_factory, monkeypatch):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
     monkeypatch.chdir(files)
     threads = torch.get_num_threads()
@@ -127,7 +130,7 @@ def in_folder(
     torch.set_num_threads(threads)
 
 
-def run_command(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
+def run_command(words, monkeypatch):
     """Run a command in this process; its exit code or message."""
     program = Path(words[0]).name
     if "--jobs" in words:  # tests/jobs/test_processes.py starts several
@@ -150,6 +153,17 @@ def run_command(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
     return cli.main()
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_commands_of_a_page_have_the_options_and_blocks_of_python_are_python(
+    page,
+):
+    for kind, text in steps(page):
+        if kind == "python":
+            compile(text, page.name, "exec")
+        elif re.match(r"(\S*/)?curvireg (?!.*([ /=$][A-Z]+([ ./]|$)|[|<>&]|--version))", text):
+            cli.parse(split_command(text)[1:])
+
+
 @pytest.mark.usefixtures("in_folder")
 @pytest.mark.parametrize(
     "page",
@@ -160,9 +174,7 @@ def run_command(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
     ],
     ids=lambda p: str(p.relative_to(ROOT)),
 )
-def test_page_runs(
-    page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_page_runs(page, monkeypatch, capsys):
     names: dict[str, Any] = {"__name__": "page"}
     for kind, text in steps(page):
         if kind == "python":
@@ -187,12 +199,12 @@ def test_page_runs(
 
 @pytest.mark.parametrize("page", FIRST_PAGES, ids=lambda page: page.stem)
 def test_the_first_pages_run_on_the_files_of_the_demo_alone(
-    page: Path,
-    tmp_path: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    page,
+    tmp_path,
+    tmp_path_factory,
+    monkeypatch,
+    capsys,
+):
     """Typed as they stand, in a folder that holds nothing else."""
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
     monkeypatch.chdir(tmp_path)
@@ -218,7 +230,7 @@ def test_the_first_pages_run_on_the_files_of_the_demo_alone(
         assert Path(name).is_file(), f"the page promises {name}"
 
 
-def check_printed(page: Path, printed: str) -> None:
+def check_printed(page, printed):
     """The page shows what its block prints, but for the last digits."""
     shown = re.search(r"```text\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     if shown is None:

@@ -1,7 +1,6 @@
 """The notebooks are those of the gallery, and run."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -12,12 +11,12 @@ MAKE = module_of_docs("make_notebooks")
 NAMES = [source.name for source in MAKE.SOURCES]
 
 
-def cells(source: Path) -> list[dict[str, object]]:
+def cells(source):
     return json.loads(MAKE.notebook_path(source).read_text(encoding="utf-8"))["cells"]
 
 
 @pytest.mark.parametrize("source", MAKE.SOURCES, ids=NAMES)
-def test_notebooks_are_current(source: Path) -> None:
+def test_notebooks_are_current(source):
     """``python docs/make_notebooks.py`` writes them."""
     assert MAKE.notebook_path(source).read_text(encoding="utf-8") == MAKE.notebook(source)
     texts = ["".join(cell["source"]) for cell in cells(source) if cell["cell_type"] == "markdown"]
@@ -32,7 +31,7 @@ def test_notebooks_are_current(source: Path) -> None:
     assert [line for line in code.splitlines() if line.strip()] == kept, "no code is lost"
 
 
-def test_each_user_has_a_notebook() -> None:
+def test_each_user_has_a_notebook():
     assert sorted(path.name for path in (DOCS / "notebooks").glob("*.ipynb")) == [
         "1_part.ipynb",
         "2_table.ipynb",
@@ -42,7 +41,7 @@ def test_each_user_has_a_notebook() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", MAKE.SOURCES, ids=NAMES)
-def test_notebooks_run(source: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_notebooks_run(source, monkeypatch, capsys):
     """Cell by cell in one namespace, as Jupyter does; the hosted workflow runs Jupyter itself."""
     pyplot = pytest.importorskip("matplotlib.pyplot", reason="matplotlib is not installed")
     pyplot.switch_backend("agg")

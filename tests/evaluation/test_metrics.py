@@ -9,7 +9,6 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import metrics
@@ -24,17 +23,17 @@ R = rotations(5, 0)
 SYMMETRIES = torch.eye(3, dtype=torch.float64)[None]
 
 
-def _move(T: Tensor | np.ndarray, points: Tensor = POINTS) -> np.ndarray:
+def _move(T, points=POINTS):
     T = np.asarray(T)
     return np.array([T[:3, :3] @ x + T[:3, 3] for x in points.numpy()])
 
 
-def _project(xyz: np.ndarray, camera: Tensor) -> np.ndarray:
+def _project(xyz, camera):
     uvw = xyz @ camera.numpy().T
     return uvw[:, :2] / uvw[:, 2:]
 
 
-def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict() -> None:
+def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict():
     errors = torch.tensor([0.0, 9.999, 10.0, 29.0, 30.0, torch.inf])
     assert metrics.average_recall(errors, (10.0,)) == pytest.approx(2 / 6)
     assert metrics.average_recall(errors, (30.0,)) == pytest.approx(4 / 6)
@@ -69,7 +68,7 @@ def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict() 
                 average(bad)
 
 
-def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity() -> None:
+def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity():
     est = rotations(10, 2)
     gt = rotations(10, 3)
     symmetries = rotations(4, 4)
@@ -89,7 +88,7 @@ def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity() 
 @pytest.mark.parametrize(
     ("value", "whole"), [(math.nan, True), (math.nan, False), (-math.inf, False)]
 )
-def test_rotation_errors_of_missing_estimates_are_infinite(value: float, whole: bool) -> None:
+def test_rotation_errors_of_missing_estimates_are_infinite(value, whole):
     missing = R.clone()
     missing[2].view(-1)[slice(None) if whole else slice(0, 1)] = value
     for errors in (
@@ -100,7 +99,7 @@ def test_rotation_errors_of_missing_estimates_are_infinite(value: float, whole: 
         assert float(errors[[0, 1, 3, 4]].max()) < 1e-5
 
 
-def test_add_and_adds_against_loops() -> None:
+def test_add_and_adds_against_loops():
     add = [np.linalg.norm(_move(e) - _move(g), axis=1).mean() for e, g in zip(EST, GT, strict=True)]
     adds = [cdist(_move(g), _move(e)).min(1).mean() for e, g in zip(EST, GT, strict=True)]
     np.testing.assert_allclose(metrics.add_error(EST, GT, POINTS), add)
@@ -115,7 +114,7 @@ def test_add_and_adds_against_loops() -> None:
     assert float(metrics.adds_error(est, gt, points)) == pytest.approx(forward)
 
 
-def test_mssd_and_mspd_against_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mssd_and_mspd_against_loops(monkeypatch):
     symmetries = torch.stack([torch.eye(4, dtype=torch.float64), *poses(3, 5)])
     symmetries[:, :3, 3] *= 0.02
     cameras = K.repeat(5, 1, 1)
@@ -138,8 +137,8 @@ def test_mssd_and_mspd_against_loops(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     """Scores of cans with 315 symmetries took minutes."""
     angles = torch.arange(315.0, dtype=torch.float64) * (2 * math.pi / 315)
     symmetries = torch.eye(4, dtype=torch.float64).repeat(315, 1, 1)
@@ -158,7 +157,7 @@ def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(
     assert sum(moved) < 0.25 * 3 * len(EST) * 315 * len(points)
 
 
-def test_mspd_error_is_infinite_for_points_behind_the_camera() -> None:
+def test_mspd_error_is_infinite_for_points_behind_the_camera():
     behind = EST.clone()
     behind[2, 2, 3] = 0.1
     mspd = metrics.mspd_error(behind, GT, POINTS, K)
@@ -175,7 +174,7 @@ ERRORS = [
 
 
 @pytest.mark.parametrize("error", ERRORS)
-def test_pose_errors_contract(error: Callable[[Tensor, Tensor, Tensor], Tensor]) -> None:
+def test_pose_errors_contract(error):
     whole = error(EST, GT, POINTS)
     for value in (math.nan, math.inf):
         missing = EST.clone()
@@ -220,13 +219,13 @@ WRONG: dict[str, Callable[[], object]] = {
 }
 
 
-def test_metrics_refuse_wrong_input() -> None:
+def test_metrics_refuse_wrong_input():
     for message, call in WRONG.items():
         with pytest.raises(InvalidInputError, match=f"^{message}"):
             call()
 
 
-def test_the_largest_distance_of_one_pose_is_that_of_all_points() -> None:
+def test_the_largest_distance_of_one_pose_is_that_of_all_points():
     """The point that moves farthest is none of those that bound the maximum."""
     points = torch.zeros(2 * metrics.BOUNDING_POINTS, 3, dtype=torch.float64)
     points[1] = torch.tensor([1.0, 0.0, 0.0])

@@ -18,7 +18,7 @@ from tests._support.small import rows_of, run
 from tests.registration.test_several import WORLD, photograph
 
 
-def photograph_in_mm(azimuth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def photograph_in_mm(azimuth):
     """Picture, box and ``T_cam_from_model`` of the truck."""
     image, box, T = photograph(azimuth, int(azimuth), 0.0)
     return image, box, transform(T[:3, :3], 1000.0 * T[:3, 3])
@@ -124,6 +124,7 @@ def test_instances_are_told_apart_by_their_place():
     assert same_instances(listed) == [[0, 3], [1, 2]]
 
 
+@pytest.mark.slow
 def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
     benchmark = BOPBenchmark(trucks, Protocol(pose="any", views=3))
     broken = trucks.root / "test" / "000002" / "rgb" / "000003.png"

@@ -14,7 +14,7 @@ from curvireg_torch.filters import image_gradient
 from ..filters.layer_cases import photos
 
 
-def _slow_hog(field: np.ndarray, grid: int, bins: int, block: int, clip: float) -> np.ndarray:
+def _slow_hog(field, grid, bins, block, clip):
     """Linear voting pixel by pixel."""
     _, H, W = field.shape
     cells = np.zeros((grid, grid, bins))
@@ -42,7 +42,7 @@ def _slow_hog(field: np.ndarray, grid: int, bins: int, block: int, clip: float) 
 
 
 @pytest.mark.parametrize(("shape", "grid"), [((24, 24), 4), ((21, 30), 4)])
-def test_hog_with_linear_voting_against_loops(shape: tuple[int, int], grid: int) -> None:
+def test_hog_with_linear_voting_against_loops(shape, grid):
     field = torch.randn(
         1, 2, *shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
@@ -52,7 +52,7 @@ def test_hog_with_linear_voting_against_loops(shape: tuple[int, int], grid: int)
 
 @pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e6])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_hog_is_invariant_to_sign_and_contrast(factor: float, dtype: torch.dtype) -> None:
+def test_hog_is_invariant_to_sign_and_contrast(factor, dtype):
     generator = torch.Generator().manual_seed(0)
     field = torch.randn(2, 2, 32, 32, generator=generator, dtype=dtype)
     signs = torch.where(torch.rand(2, 1, 32, 32, generator=generator) < 0.5, -1.0, 1.0)
@@ -61,7 +61,7 @@ def test_hog_is_invariant_to_sign_and_contrast(factor: float, dtype: torch.dtype
     assert not hog(torch.zeros_like(field)).any()
 
 
-def test_hog_suppresses_blocks_far_below_the_strongest() -> None:
+def test_hog_suppresses_blocks_far_below_the_strongest():
     field = torch.zeros(1, 2, 64, 64, dtype=torch.float64)
     field[:, 0, :32] = 1.0
     field[:, 1, 32:] = 1e-13  # rounding
@@ -70,7 +70,7 @@ def test_hog_suppresses_blocks_far_below_the_strongest() -> None:
     assert float(lengths[5:].max()) < 0.01
 
 
-def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt() -> None:
+def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt():
     field = torch.randn(2, 2, 32, 32, generator=torch.Generator().manual_seed(1))
     without = hog(field, bin_weights=torch.tensor([0.0, *[1.0] * 8]))
     assert float(without.view(2, -1, 9)[..., 0].abs().max()) == 0.0
@@ -94,7 +94,7 @@ def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt() -> None:
     assert float(out.min()) >= 0.0
 
 
-def test_hog_rejects_wrong_weights_and_grids() -> None:
+def test_hog_rejects_wrong_weights_and_grids():
     for options, message in (
         *(
             ({"bin_weights": torch.tensor([w, *[1.0] * 8])}, "expected factors >= 0")
@@ -107,7 +107,7 @@ def test_hog_rejects_wrong_weights_and_grids() -> None:
             hog(torch.zeros(1, 2, 16, 16), **options)
 
 
-def _line(angle: float) -> torch.Tensor:
+def _line(angle):
     """A ridge through the centre of a 41 px image, the field pointing across it."""
     axis = torch.arange(41.0) - 20
     y, x = torch.meshgrid(axis, axis, indexing="ij")
@@ -120,7 +120,7 @@ def _line(angle: float) -> torch.Tensor:
 
 @pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 70.0, 90.0, 135.0, 160.0])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_field_points_of_a_ridge_are_a_thin_line(angle: float, sign: float) -> None:
+def test_field_points_of_a_ridge_are_a_thin_line(angle, sign):
     field = sign * _line(angle)[None]
     points = (field_points(field, fraction=1.0) & (field.norm(dim=1, keepdim=True) > 0.5))[0, 0]
     y, x = (points.nonzero().T - 20).float()
@@ -132,9 +132,7 @@ def test_field_points_of_a_ridge_are_a_thin_line(angle: float, sign: float) -> N
 
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 1000), fraction=st.floats(0.01, 0.3))
-def test_field_points_fraction_selects_the_longest_of_each_image(
-    seed: int, fraction: float
-) -> None:
+def test_field_points_fraction_selects_the_longest_of_each_image(seed, fraction):
     field = image_gradient(photos(3, 24, seed=seed, dtype=torch.float64))
     field = field * torch.tensor([1.0, 0.01, 5.0]).view(3, 1, 1, 1)
     points = field_points(field, fraction=fraction)
@@ -147,20 +145,20 @@ def test_field_points_fraction_selects_the_longest_of_each_image(
             assert float(v[p].min()) >= float(v[e & ~p].max())
 
 
-def test_field_points_of_a_ridge_two_pixels_wide_are_one_pixel_wide() -> None:
+def test_field_points_of_a_ridge_two_pixels_wide_are_one_pixel_wide():
     field = torch.zeros(1, 2, 5, 8)
     field[0, 0, :, 2:6] = torch.tensor([1.0, 2.0, 2.0, 1.0])
     assert field_points(field, fraction=1.0)[0, 0].sum(dim=1).tolist() == [1] * 5
 
 
-def test_hog_keeps_its_precision_under_autocast() -> None:
+def test_hog_keeps_its_precision_under_autocast():
     field = torch.randn(2, 2, 40, 48, generator=torch.Generator().manual_seed(0))
     with torch.autocast("cpu", dtype=torch.bfloat16):
         autocast = hog(field)
     assert torch.equal(autocast, hog(field))
 
 
-def test_hog_is_one_graph() -> None:
+def test_hog_is_one_graph():
     """Traced only: the slow tests compile it."""
     torch._dynamo.reset()
     field = torch.randn(2, 2, 32, 32, generator=torch.Generator().manual_seed(0))
@@ -169,16 +167,14 @@ def test_hog_is_one_graph() -> None:
 
 
 @pytest.mark.parametrize("learnable", [False, True])
-def test_hog_on_the_meta_device(learnable: bool) -> None:
+def test_hog_on_the_meta_device(learnable):
     layer = features.HOG(grid=4, learnable=learnable).to("meta")
     descriptors = layer(torch.zeros(3, 2, 40, 48, device="meta"))
     assert (descriptors.device.type, descriptors.shape) == ("meta", (3, layer.length))
 
 
 @pytest.mark.parametrize(("bins", "learnable"), [(9, False), (8, True), (1, False)])
-def test_descriptor_of_a_quarter_turn_is_that_of_the_rotated_field(
-    bins: int, learnable: bool
-) -> None:
+def test_descriptor_of_a_quarter_turn_is_that_of_the_rotated_field(bins, learnable):
     generator = torch.Generator().manual_seed(0)
     field = torch.randn(3, 2, 40, 40, generator=generator, dtype=torch.float64)
     field[1, 0, 3, 4] = math.nan

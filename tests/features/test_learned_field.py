@@ -32,7 +32,7 @@ class TestLearnedField(LayerContract):
     )
     test_gradcheck = test_function_transforms = None  # the network computes in float32
 
-    def test_batched_equals_one_by_one(self, case: LayerCase) -> None:
+    def test_batched_equals_one_by_one(self, case):
         x = case.inputs(3, 48)
         assert equal_up_to_sign(case(x), torch.cat([case(image[None]) for image in x]), atol=1e-3)
 
@@ -135,7 +135,7 @@ def test_learned_field_under_autocast(field):
 
 
 @pytest.mark.parametrize("shape", [(2, 600), (600, 2), (1, 1), (1, 5000)])
-def test_learned_field_does_not_enlarge_slivers(shape: tuple[int, int]) -> None:
+def test_learned_field_does_not_enlarge_slivers(shape):
     field = LearnedCurvilinearSaliency()
     field.network.forward = Mock(
         side_effect=lambda x: x.new_zeros(len(x), 3, x.shape[2] // 2, x.shape[3] // 2)
@@ -144,7 +144,7 @@ def test_learned_field_does_not_enlarge_slivers(shape: tuple[int, int]) -> None:
     assert field.network.forward.call_args.args[0][0, 0].numel() <= 8 * 128 * 128
 
 
-def test_fields_fill_missing_pixels() -> None:
+def test_fields_fill_missing_pixels():
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(1, 3, 64, 64, generator=generator)
     lost = image.clone()

@@ -1,12 +1,10 @@
 """Layers on surfaces, edges, lines and ramps with known results."""
 
 import math
-from collections.abc import Callable
 from functools import partial
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch import filters
 
@@ -15,12 +13,12 @@ from .layer_cases import cylinder, grid, plane, sphere
 SIZES = (33, 65, 129)
 
 
-def _saliency(depth: Tensor, **options: object) -> Tensor:
+def _saliency(depth, **options):
     """CS without smoothing or rescaling, depth in px."""
     return filters.depth_curvilinear_saliency(depth, sigma=0.0, depth_scale=1.0, **options)
 
 
-def _round_error(size: int, make: Callable[..., Tensor], want: float) -> float:
+def _round_error(size, make, want):
     """Error of the CS of a sphere or cylinder, relative to 1 / radius."""
     radius = 0.75 * size
     x, y = grid(size)
@@ -32,7 +30,7 @@ def _round_error(size: int, make: Callable[..., Tensor], want: float) -> float:
     )
 
 
-def _saddle_error(size: int) -> float:
+def _saddle_error(size):
     """kappa1 - kappa2 of z = (x^2 - y^2) / (2 a) + (x^4 - y^4) / (8 a^3), whose curvatures at 0 are
     those of the saddle."""
     a = 0.5 * size
@@ -42,7 +40,7 @@ def _saddle_error(size: int) -> float:
     return abs(float(_saliency(z)[0, :, centre, centre].norm()) * a / 2.0 - 1.0)
 
 
-def test_depth_curvilinear_saliency_converges_with_order_two() -> None:
+def test_depth_curvilinear_saliency_converges_with_order_two():
     rounds = (
         partial(_round_error, make=sphere, want=0.0),
         partial(_round_error, make=cylinder, want=1.0),
@@ -56,9 +54,7 @@ def test_depth_curvilinear_saliency_converges_with_order_two() -> None:
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 2.0])
 @pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.5, 0.0), (0.3, -2.0)])
-def test_depth_layers_are_zero_on_a_plane_up_to_the_border(
-    sigma: float, slopes: tuple[float, float]
-) -> None:
+def test_depth_layers_are_zero_on_a_plane_up_to_the_border(sigma, slopes):
     depth = plane(33, *slopes, distance=200.0)
     for layer in (
         filters.depth_curvilinear_saliency,
@@ -71,7 +67,7 @@ def test_depth_layers_are_zero_on_a_plane_up_to_the_border(
     assert float(filters.apparent_ridges(depth, sigma=sigma, maxima=False).abs().max()) < 1e-9
 
 
-def test_depth_curvilinear_saliency_formulas_differ_by_the_metric() -> None:
+def test_depth_curvilinear_saliency_formulas_differ_by_the_metric():
     depth = cylinder(65, 60.0, 100.0)
     geometric, paper = (_saliency(depth, formula=f).norm(dim=1)[0] for f in ("geometric", "paper"))
     slope = 0.5 * (depth[0, 0, :, 2:] - depth[0, 0, :, :-2])
@@ -81,7 +77,7 @@ def test_depth_curvilinear_saliency_formulas_differ_by_the_metric() -> None:
     )
 
 
-def test_depth_layers_put_the_background_a_quarter_of_the_range_behind_the_object() -> None:
+def test_depth_layers_put_the_background_a_quarter_of_the_range_behind_the_object():
     depth = sphere(33, 12.0, 50.0)
     near = float(depth[depth > 0].min())
     far = float(depth.max())
@@ -96,7 +92,7 @@ def test_depth_layers_put_the_background_a_quarter_of_the_range_behind_the_objec
         )
 
 
-def test_average_shading_gradient_of_a_sphere() -> None:
+def test_average_shading_gradient_of_a_sphere():
     """N = (x, y, .) / r, so |N_x|^2 + |N_y|^2 = (2 + rho^2 / (r^2 - rho^2)) / r^2."""
     radius = 60.0
     x, y = grid(65)
@@ -110,15 +106,15 @@ def test_average_shading_gradient_of_a_sphere() -> None:
     torch.testing.assert_close(field.norm(dim=1)[0][inside], want[inside], rtol=2e-3, atol=0.0)
 
 
-def _camera(focal: float, size: int) -> Tensor:
+def _camera(focal, size):
     c = (size - 1) / 2
     return torch.tensor([[focal, 0.0, c], [0.0, focal, c], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
 def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_unit(
-    unit: float,
-) -> None:
+    unit,
+):
     """fx != fy and cx != cy: the normal (point - centre) / radius is differentiated numerically."""
     H = 49
     W = 61
@@ -128,7 +124,7 @@ def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_
         [[130.0, 0.0, 24.0], [0.0, 90.0, 31.0], [0.0, 0.0, 1.0]], dtype=torch.float64
     )
 
-    def surface(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    def surface(u, v):
         """Depth and normals (3, ...) at pixels u, v, of a sphere around (0.2, -0.1, d)."""
         ray = torch.stack([(u - 24.0) / 130.0, (v - 31.0) / 90.0, torch.ones_like(u)])
         centre = torch.tensor([0.2, -0.1, d], dtype=torch.float64).view(3, 1, 1)
@@ -153,7 +149,7 @@ def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_
     torch.testing.assert_close(ridges[inner], q1[inner], rtol=5e-3, atol=0.0)
 
 
-def test_hessian_frobenius_norm_of_a_quadratic() -> None:
+def test_hessian_frobenius_norm_of_a_quadratic():
     x, y = grid(33)
     z = (900.0 + 0.5 * x**2 + 2.0 * x * y - 1.5 * y**2)[None, None]
     field = filters.hessian_frobenius_norm(z, sigma=0.0, depth_scale=1.0)[0, :, 1:-1, 1:-1]
@@ -165,7 +161,7 @@ def test_hessian_frobenius_norm_of_a_quadratic() -> None:
     torch.testing.assert_close((field[:, 3, 3] / field[:, 3, 3].norm()).abs(), along.abs())
 
 
-def test_apparent_ridges_of_a_cylinder_and_a_roof() -> None:
+def test_apparent_ridges_of_a_cylinder_and_a_roof():
     """Across a cylinder the normal changes by 1 / (r cos) per px; on a roof it changes only at the
     edge."""
     radius = 60.0
@@ -197,7 +193,7 @@ FIELDS = {
 
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("distance", [0.3, 5.0, 4e6])
-def test_depth_layers_ignore_noise_of_one_ulp(field: str, distance: float) -> None:
+def test_depth_layers_ignore_noise_of_one_ulp(field, distance):
     depth = torch.zeros(2, 1, 96, 96)
     depth[..., 30:70, 25:75] = distance
     half = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) < 0.5
@@ -208,7 +204,7 @@ def test_depth_layers_ignore_noise_of_one_ulp(field: str, distance: float) -> No
     assert float((a * b).sum(dim=1).abs().sum() / (a.norm() * b.norm())) > 0.9999
 
 
-def test_multiscale_focus_curves_rank_edges_by_sharpness() -> None:
+def test_multiscale_focus_curves_rank_edges_by_sharpness():
     x, _ = grid(121)
     sharp, blurred = (
         torch.erf((x - c) / (s * math.sqrt(2.0))) for c, s in ((-30.0, 1.0), (30.0, 3.0))
@@ -222,7 +218,7 @@ def test_multiscale_focus_curves_rank_edges_by_sharpness() -> None:
     assert float(1 / focus[90]) == pytest.approx(math.sqrt(9 + 1), rel=0.03)
 
 
-def test_multiscale_focus_curves_leave_weak_edges_out() -> None:
+def test_multiscale_focus_curves_leave_weak_edges_out():
     """CS is a square: of the strongest edge's contrast, a tenth gives .01 and a quarter .06."""
     x, _ = grid(161)
     strong, quarter, tenth = (torch.erf((x - c) / (2.0 * math.sqrt(2.0))) for c in (-50.0, 0, 50.0))
@@ -234,7 +230,7 @@ def test_multiscale_focus_curves_leave_weak_edges_out() -> None:
     torch.testing.assert_close(default[[30, 80]], every[[30, 80]])
 
 
-def test_principal_curvature_image_of_a_dark_line() -> None:
+def test_principal_curvature_image_of_a_dark_line():
     x, _ = grid(65)
     bright = torch.exp(-0.5 * (x / 2.0) ** 2)[None, None]
     field = filters.principal_curvature_image(1 - bright)[0, :, 32]

@@ -7,19 +7,18 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 from torch._dynamo.testing import CompileCounter
 
 from curvireg_torch import filters
 
-from .._support.layer_contract import LayerCase, LayerContract
+from .._support.layer_contract import LayerContract
 from .layer_cases import LAYERS, PAIRS, depths, equal_up_to_sign, photos
 
 
 class TestLayers(LayerContract):
     cases = tuple(LAYERS.values())
 
-    def gradcheck_weights(self, case: LayerCase, x: torch.Tensor) -> float | torch.Tensor:
+    def gradcheck_weights(self, case, x):
         # At the strongest pixel all levels of MCS are 1, and rounding decides which of them is
         # selected.
         return (
@@ -31,7 +30,7 @@ class TestLayers(LayerContract):
     "layer", [x for x in LAYERS.values() if x.inputs is depths], ids=lambda x: x.name
 )
 @pytest.mark.parametrize("hole", [torch.nan, torch.inf, -torch.inf, 0.0])
-def test_depth_layers_are_finite_with_missing_depth(layer: LayerCase, hole: float) -> None:
+def test_depth_layers_are_finite_with_missing_depth(layer, hole):
     x = depths(2)
     x[0, 0, 10:13, 9:14] = hole
     x[1] = hole  # no visible pixel
@@ -64,7 +63,7 @@ class TestCompiled:
     }
 
     @pytest.mark.parametrize("name", list(values))
-    def test_any_value_of_a_float_option(self, name: str) -> None:
+    def test_any_value_of_a_float_option(self, name):
         """At the second value of a float torch.compile makes it a symbol."""
         torch._dynamo.reset()
         function, inputs = PAIRS[name][:2]
@@ -74,7 +73,7 @@ class TestCompiled:
             assert LayerContract().agrees(graph(x, **options), function(x, **options)), options
 
 
-def test_learnt_values_need_one_graph_for_all_steps() -> None:
+def test_learnt_values_need_one_graph_for_all_steps():
     torch._dynamo.reset()
     module = filters.ImageGradient(learnable=True)
     counter = CompileCounter()
@@ -104,11 +103,11 @@ few = settings(max_examples=3, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
 
 
-def _input(layer: LayerCase, seed: int, size: int = 25) -> Tensor:
+def _input(layer, seed, size=25):
     return layer.inputs(1, size, seed=seed, dtype=torch.float64)
 
 
-def _close(a: Tensor, b: Tensor) -> bool:
+def _close(a, b):
     """Equality up to sign, except for 0.5 % of the vectors at a switch (tied scales, a
     threshold)."""
     scale = float(b.abs().max()) + 1e-12
@@ -119,7 +118,7 @@ def _close(a: Tensor, b: Tensor) -> bool:
 @every_field
 @few
 @given(seed=seeds)
-def test_fields_rotate_and_mirror_with_the_image(layer: LayerCase, seed: int) -> None:
+def test_fields_rotate_and_mirror_with_the_image(layer, seed):
     x = _input(layer, seed)
     options = dict(layer.options)
     if "camera_matrix" in options:  # one that is centred on the 25 px image, and so as symmetric
@@ -138,9 +137,7 @@ def test_fields_rotate_and_mirror_with_the_image(layer: LayerCase, seed: int) ->
 @pytest.mark.parametrize("name", ["cs", "cs-paper", "asg", "hfn"])
 @few
 @given(seed=seeds, offset=st.floats(0.0, 50.0), factor=st.floats(0.1, 10.0))
-def test_depth_fields_with_unit_range_are_invariant_to_offset_and_unit(
-    name: str, seed: int, offset: float, factor: float
-) -> None:
+def test_depth_fields_with_unit_range_are_invariant_to_offset_and_unit(name, seed, offset, factor):
     layer = LAYERS[name]
     z = _input(layer, seed)
     moved = torch.where(z > 0, factor * (z + offset), 0.0)

@@ -2,11 +2,9 @@
 differences depend."""
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch import filters
 from curvireg_torch.filters.focus import MODES
@@ -20,12 +18,12 @@ in_all_directions = pytest.mark.parametrize("angle", ANGLES)
 in_both_modes = pytest.mark.parametrize("mode", MODES)
 
 
-def direction(angle: float) -> tuple[float, float]:
+def direction(angle):
     radians = math.radians(angle)
     return math.cos(radians), math.sin(radians)
 
 
-def across(angle: float, offset: float = 0.0) -> Tensor:
+def across(angle, offset=0.0):
     """Distance in px of each pixel from a line at ``offset`` px from the middle, whose normal has
     the angle."""
     x, y = grid(SIZE)
@@ -33,14 +31,14 @@ def across(angle: float, offset: float = 0.0) -> Tensor:
     return gx * x + gy * y - offset
 
 
-def edge(angle: float, blur: float, *, contrast: float = 1.0, offset: float = 0.0) -> Tensor:
+def edge(angle, blur, *, contrast=1.0, offset=0.0):
     """(1, 1, SIZE, SIZE) step from 0 to ``contrast``, blurred."""
     return (0.5 * contrast * (1.0 + torch.erf(across(angle, offset) / (blur * math.sqrt(2.0)))))[
         None, None
     ]
 
 
-def difference_variance(angle: float) -> float:
+def difference_variance(angle):
     """Variance in px^2 that central differences add to an edge across the direction."""
     gx, gy = direction(angle)
     return (gx**4 + gy**4) / 3.0
@@ -49,7 +47,7 @@ def difference_variance(angle: float) -> float:
 @in_all_directions
 @in_both_modes
 @pytest.mark.parametrize("blur", [1.0, 1.5, 2.0, 3.0, 4.0])
-def test_edge_blur_in_all_directions(angle: float, mode: str, blur: float) -> None:
+def test_edge_blur_in_all_directions(angle, mode, blur):
     estimates = filters.edge_blur(edge(angle, blur), mode=mode)[0, :, MIDDLE, MIDDLE]
     assert estimates.tolist() == pytest.approx([blur] * 4, rel=0.015)
     assert bool((estimates > 0.999 * blur).all())  # the focus 1/s does not exceed 1/blur
@@ -58,9 +56,7 @@ def test_edge_blur_in_all_directions(angle: float, mode: str, blur: float) -> No
 @in_all_directions
 @in_both_modes
 @pytest.mark.parametrize("offset", [0.0, 0.25, 0.5])
-def test_multiscale_focus_curves_keep_their_bound_in_all_directions(
-    angle: float, mode: str, offset: float
-) -> None:
+def test_multiscale_focus_curves_keep_their_bound_in_all_directions(angle, mode, offset):
     for blur, sigma in ((1.0, 0.0), (0.7, 1.0), (2.0, 1.0), (1.5, 1.5)):
         image = edge(angle, blur, offset=offset)
         field = filters.multiscale_focus_curves(image, sigma=sigma, mode=mode, saliency_weight=0.0)
@@ -71,17 +67,17 @@ def test_multiscale_focus_curves_keep_their_bound_in_all_directions(
         assert offset > 0.0 or largest > 0.985 * bound  # where a pixel lies on the centre line
 
 
-def test_multiscale_focus_curves_are_at_most_their_limit_elsewhere() -> None:
+def test_multiscale_focus_curves_are_at_most_their_limit_elsewhere():
     noise = torch.rand(2, 1, 40, 40, generator=torch.Generator().manual_seed(0))
     field = filters.multiscale_focus_curves(noise, sigma=0.0, saliency_weight=0.0)
     assert float(field.norm(dim=1).max()) == pytest.approx(1 / 0.6)
 
 
-def _gradient_peak(image: Tensor, sigma: float) -> float:
+def _gradient_peak(image, sigma):
     return float(filters.image_gradient(image, sigma=sigma)[0, :, MIDDLE, MIDDLE].norm())
 
 
-def _saliency_peak(image: Tensor, sigma: float) -> float:
+def _saliency_peak(image, sigma):
     return math.sqrt(
         float(filters.image_curvilinear_saliency(image, sigma=sigma)[0, :, MIDDLE, MIDDLE].norm())
     )
@@ -90,9 +86,7 @@ def _saliency_peak(image: Tensor, sigma: float) -> float:
 @in_all_directions
 @pytest.mark.parametrize("peak", [_gradient_peak, _saliency_peak])
 @pytest.mark.parametrize(("blur", "sigma"), [(1.5, 0.0), (1.0, 1.0), (2.0, 1.0), (1.0, 3.0)])
-def test_gradient_and_saliency_of_an_edge(
-    angle: float, peak: Callable[[Tensor, float], float], blur: float, sigma: float
-) -> None:
+def test_gradient_and_saliency_of_an_edge(angle, peak, blur, sigma):
     """A / sqrt(2 pi s^2), where s^2 is the sum of the variances of edge, smoothing and
     differences."""
     total = blur**2 + sigma**2 + difference_variance(angle)
@@ -102,7 +96,7 @@ def test_gradient_and_saliency_of_an_edge(
     assert math.degrees(math.atan2(gy, gx)) == pytest.approx(angle, abs=2.0)
 
 
-def test_saliency_of_equal_edges_hardly_depends_on_the_direction() -> None:
+def test_saliency_of_equal_edges_hardly_depends_on_the_direction():
     """MCS divides by the strongest edge of the image: with sigma 1 the direction changes CS by less
     than a fifth, about (1 + 1/3) / (1 + 1/6), which is little beside its threshold exp(-5)."""
     sharp = [_saliency_peak(edge(angle, 0.4), 1.0) ** 2 for angle in ANGLES]
@@ -110,7 +104,7 @@ def test_saliency_of_equal_edges_hardly_depends_on_the_direction() -> None:
 
 
 @in_all_directions
-def test_second_derivatives_across_a_ridge(angle: float) -> None:
+def test_second_derivatives_across_a_ridge(angle):
     """z = -h exp(-t^2 / 2 w^2) has |z''| = h w / (w^2 + v)^1.5 on its line, where v is the variance
     of smoothing and of the second differences. Differences along the line are not zero on the grid;
     CS subtracts them."""
@@ -131,7 +125,7 @@ def test_second_derivatives_across_a_ridge(angle: float) -> None:
 
 
 @in_all_directions
-def test_depth_curvilinear_saliency_of_a_cylinder_in_all_directions(angle: float) -> None:
+def test_depth_curvilinear_saliency_of_a_cylinder_in_all_directions(angle):
     radius = 60.0
     depth = (100.0 - (radius**2 - across(angle) ** 2).clamp(min=0.0).sqrt())[None, None]
     field = filters.depth_curvilinear_saliency(depth, sigma=0.0, depth_scale=1.0)
@@ -141,7 +135,7 @@ def test_depth_curvilinear_saliency_of_a_cylinder_in_all_directions(angle: float
 
 
 @in_all_directions
-def test_principal_curvature_image_of_a_line_in_all_directions(angle: float) -> None:
+def test_principal_curvature_image_of_a_line_in_all_directions(angle):
     line = 1.0 - torch.exp(-0.5 * (across(angle) / 2.0) ** 2)[None, None]
     vector = filters.principal_curvature_image(line)[0, :, MIDDLE, MIDDLE]
     assert float(vector.norm()) == pytest.approx(2.8**2 * 2 / (4 + 2.8**2) ** 1.5, rel=0.03)

@@ -11,20 +11,19 @@ from curvireg_torch.errors import CurviregWarning
 from curvireg_torch.features import field_points, hog
 from curvireg_torch.filters.operations import fill_missing, to_grey
 
-from .._support.layer_contract import LayerCase
 from .layer_cases import LAYERS, colour_photos, photos
 
 PHOTO_LAYERS = [layer for layer in LAYERS.values() if layer.inputs is photos]
 every_photo_layer = pytest.mark.parametrize("layer", PHOTO_LAYERS, ids=lambda layer: layer.name)
 
 
-def missing_value(layer: LayerCase) -> float:
+def missing_value(layer):
     return 1000.0 if layer.name.startswith("blur") else 0.0
 
 
 @every_photo_layer
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_photo_layers_fill_missing_pixels(layer: LayerCase, value: float) -> None:
+def test_photo_layers_fill_missing_pixels(layer, value):
     x = photos(2, 48, dtype=torch.float64)
     clean = layer(x)
     broken = x.clone()
@@ -46,7 +45,7 @@ def test_photo_layers_fill_missing_pixels(layer: LayerCase, value: float) -> Non
     assert float(empty.min()) == float(empty.max()) == missing_value(layer)
 
 
-def test_fill_missing_uses_the_surroundings() -> None:
+def test_fill_missing_uses_the_surroundings():
     """On a ramp of 1 per px the error of the fill is at most the size of its pyramid cell."""
     ramp = torch.arange(64.0, dtype=torch.float64).expand(1, 1, 50, 64).contiguous()
     for size in (1, 3, 8):
@@ -68,9 +67,7 @@ def test_fill_missing_uses_the_surroundings() -> None:
 @pytest.mark.filterwarnings("ignore:There is a performance drop")
 @every_photo_layer
 @pytest.mark.parametrize("corner", [(0, 0), (5, 9)])
-def test_a_padded_batch_gives_what_each_photograph_alone_gives(
-    layer: LayerCase, corner: tuple[int, int]
-) -> None:
+def test_a_padded_batch_gives_what_each_photograph_alone_gives(layer, corner):
     """Pixels beyond the photograph are outside, as its border is: no edge where it ends."""
     alone = photos(1, 40, dtype=torch.float64)
     other = photos(1, 64, seed=1, dtype=torch.float64)
@@ -92,9 +89,7 @@ def test_a_padded_batch_gives_what_each_photograph_alone_gives(
 
 @pytest.mark.parametrize("unit", ["0 to 255", "normalised"])
 @every_photo_layer
-def test_images_in_another_unit_give_the_same_field_or_a_warning(
-    layer: LayerCase, unit: str
-) -> None:
+def test_images_in_another_unit_give_the_same_field_or_a_warning(layer, unit):
     image = photos(1, 32)
     scaled = 255.0 * image if unit == "0 to 255" else (image - 0.449) / 0.226
     if layer.name.startswith(("mcs", "diffusion")):
@@ -111,16 +106,14 @@ def test_images_in_another_unit_give_the_same_field_or_a_warning(
     )
 
 
-def test_the_learned_field_warns_of_images_in_another_unit() -> None:
+def test_the_learned_field_warns_of_images_in_another_unit():
     with pytest.warns(CurviregWarning, match="the network was trained on these"):
         cr.LearnedCurvilinearSaliency()(255.0 * photos(1, 32))
 
 
 @every_photo_layer
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradient_penalties_are_finite_where_images_are_flat(
-    layer: LayerCase, dtype: torch.dtype
-) -> None:
+def test_gradient_penalties_are_finite_where_images_are_flat(layer, dtype):
     flat = torch.full((1, 1, 12, 12), 0.7, dtype=dtype)
     half = torch.where(torch.arange(12) >= 6, flat, 0.2)
     holes = torch.where(torch.arange(12) >= 9, math.nan, flat)
@@ -135,7 +128,7 @@ def test_gradient_penalties_are_finite_where_images_are_flat(
 
 
 @every_photo_layer
-def test_photo_layers_convert_colour_to_grey(layer: LayerCase) -> None:
+def test_photo_layers_convert_colour_to_grey(layer):
     colour = colour_photos(2, dtype=torch.float64)
     weights = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64).view(1, 3, 1, 1)
     torch.testing.assert_close(to_grey(colour), (weights * colour).sum(dim=1, keepdim=True))
@@ -147,7 +140,7 @@ def test_photo_layers_convert_colour_to_grey(layer: LayerCase) -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_hog_and_field_points_ignore_vectors_that_are_not_finite(value: float) -> None:
+def test_hog_and_field_points_ignore_vectors_that_are_not_finite(value):
     field = filters.image_gradient(photos(2, 32))
     zero = field.clone()
     broken = field.clone()

@@ -1,7 +1,5 @@
 """Exported to ONNX, for any batch, layers give the same results."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -22,7 +20,7 @@ LAYERS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(LAYERS))
-def test_layers_in_onnx_runtime(name: str, tmp_path: Path) -> None:
+def test_layers_in_onnx_runtime(name, tmp_path):
     layer = LAYERS[name].eval()
     generator = torch.Generator().manual_seed(0)
     any_batch = {0: torch.export.Dim("batch", min=1, max=64)}

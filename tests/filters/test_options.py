@@ -4,7 +4,6 @@ their dtype."""
 import copy
 import io
 import pickle
-from collections.abc import Callable
 
 import pytest
 import torch
@@ -45,9 +44,7 @@ WRONG: list[tuple[str, dict[str, object], str]] = [
 @pytest.mark.parametrize(
     ("name", "options", "message"), WRONG, ids=[f"{x[0]}-{','.join(x[1])}" for x in WRONG]
 )
-def test_functions_and_constructors_reject_wrong_options(
-    name: str, options: dict[str, object], message: str
-) -> None:
+def test_functions_and_constructors_reject_wrong_options(name, options, message):
     function, inputs, module = PAIRS[name]
     with pytest.raises(InvalidInputError, match=message) as by_function:
         function(inputs(), **options)
@@ -56,7 +53,7 @@ def test_functions_and_constructors_reject_wrong_options(
     assert str(by_function.value) == str(by_module.value)
 
 
-def test_depth_layers_broadcast_masks() -> None:
+def test_depth_layers_broadcast_masks():
     depth = depths(3)
     mask = torch.rand(24, 24, generator=torch.Generator().manual_seed(0)) < 0.7
     want = filters.depth_curvilinear_saliency(depth, mask.expand(3, 1, 24, 24))
@@ -75,8 +72,8 @@ def test_depth_layers_broadcast_masks() -> None:
 
 @pytest.mark.parametrize("module", [filters.AverageShadingGradient, filters.ApparentRidges])
 def test_perspective_modules_keep_the_precision_of_their_camera(
-    module: Callable[..., nn.Module],
-) -> None:
+    module,
+):
     camera = CAMERA.clone()
     camera[:2, 2] += 1 / 3  # not representable in half precision
     depth = depths().half()
@@ -113,7 +110,7 @@ MODULES = {
 
 
 @pytest.mark.parametrize("name", list(MODULES))
-def test_learnable_modules_start_at_their_options_with_correct_gradients(name: str) -> None:
+def test_learnable_modules_start_at_their_options_with_correct_gradients(name):
     make, options, inputs, learnable = MODULES[name]
     x = inputs(2, 12, dtype=torch.float64)
     fixed = make(**options)
@@ -129,7 +126,7 @@ def test_learnable_modules_start_at_their_options_with_correct_gradients(name: s
     if name.startswith("mcs"):
         weights = fixed(x).norm(dim=1, keepdim=True) < 1.0 - 1e-6  # all levels are tied at the peak
 
-    def function(*values: torch.Tensor) -> torch.Tensor:
+    def function(*values):
         return (
             torch.func.functional_call(module, dict(zip(keys, values, strict=True)), (x,)) * weights
         )
@@ -143,7 +140,7 @@ def test_learnable_modules_start_at_their_options_with_correct_gradients(name: s
 
 
 @pytest.mark.parametrize("name", list(MODULES))
-def test_learnable_modules_can_be_pickled_saved_and_halved(name: str) -> None:
+def test_learnable_modules_can_be_pickled_saved_and_halved(name):
     make, options, inputs, learnable = MODULES[name]
     module = make(**options, learnable=True)
     for option in learnable:
@@ -169,7 +166,7 @@ def test_learnable_modules_can_be_pickled_saved_and_halved(name: str) -> None:
     assert half(x).dtype == torch.float32
 
 
-def test_state_of_learnable_and_fixed_modules_says_what_to_do() -> None:
+def test_state_of_learnable_and_fixed_modules_says_what_to_do():
     fixed = nn.Sequential(filters.ImageGradient(sigma=2.0), cr.HOG())
     learnt = nn.Sequential(filters.ImageGradient(learnable=True), cr.HOG(learnable=True))
     message = r"0\.log_sigma is a parameter of ImageGradient\(learnable=True\).*learnable=True"
@@ -185,7 +182,7 @@ def test_state_of_learnable_and_fixed_modules_says_what_to_do() -> None:
     assert fixed[0].options == {"sigma": 3.0}
 
 
-def test_learnable_options_reject_values_that_are_not_positive() -> None:
+def test_learnable_options_reject_values_that_are_not_positive():
     for call, message in (
         (
             lambda: filters.ImageGradient(sigma=0.0, learnable=True),
@@ -210,7 +207,7 @@ def test_learnable_options_reject_values_that_are_not_positive() -> None:
 
 @pytest.mark.filterwarnings("ignore:There is a performance drop")
 @pytest.mark.parametrize("sigma", [0.0, 0.3, 1.0, 2.5, 4.0, 5.0])
-def test_gaussian_smooth_has_the_same_kernel_for_numbers_tensors_and_graphs(sigma: float) -> None:
+def test_gaussian_smooth_has_the_same_kernel_for_numbers_tensors_and_graphs(sigma):
     """Up to 4 px the kernel of a tensor is that of the number; a larger one is cut at 16 px, traced
     or not."""
     x = photos(1, 40, dtype=torch.float64)

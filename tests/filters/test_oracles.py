@@ -15,11 +15,11 @@ from curvireg_torch.filters.operations import central_derivatives, smooth
 from .layer_cases import depths, photos
 
 
-def _smooth(x: np.ndarray, sigma: float) -> np.ndarray:
+def _smooth(x, sigma):
     return gaussian_filter(x, sigma, mode="nearest", radius=math.ceil(4 * sigma))
 
 
-def _gradient(x: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
+def _gradient(x, sigma):
     """Central differences, pixel by pixel, of the smoothed image with replicated borders."""
     H, W = x.shape
     p = _smooth(np.pad(x, 1, mode="edge"), sigma)
@@ -32,9 +32,7 @@ def _gradient(x: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
     return gx, gy
 
 
-def _perona_malik(
-    x: np.ndarray, iterations: int, kappa: float, step: float, conductance: str
-) -> np.ndarray:
+def _perona_malik(x, iterations, kappa, step, conductance):
     H, W = x.shape
     for _ in range(iterations):
         new = x.copy()
@@ -54,7 +52,7 @@ def _perona_malik(
 
 
 @pytest.mark.parametrize("conductance", ["rational", "exponential"])
-def test_anisotropic_diffusion_against_loops(conductance: str) -> None:
+def test_anisotropic_diffusion_against_loops(conductance):
     image = photos(1, 15, dtype=torch.float64)
     got = filters.anisotropic_diffusion(
         image, iterations=6, kappa=0.07, step=0.25, conductance=conductance
@@ -63,7 +61,7 @@ def test_anisotropic_diffusion_against_loops(conductance: str) -> None:
     np.testing.assert_allclose(got[0, 0], want, rtol=1e-12)
 
 
-def test_multiscale_curvilinear_saliency_against_loops() -> None:
+def test_multiscale_curvilinear_saliency_against_loops():
     image = photos(1, 17, dtype=torch.float64)
     got = filters.multiscale_curvilinear_saliency(image, scales=3, sigma=0.8, kappa=0.05)[0]
     fields = []
@@ -85,9 +83,7 @@ def test_multiscale_curvilinear_saliency_against_loops() -> None:
 @pytest.mark.parametrize("mode", ["reblur-image", "reblur-saliency"])
 @pytest.mark.parametrize("saliency_weight", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("threshold", [0.0, math.exp(-5), 0.1])
-def test_multiscale_focus_curves_against_loops(
-    mode: str, saliency_weight: float, threshold: float
-) -> None:
+def test_multiscale_focus_curves_against_loops(mode, saliency_weight, threshold):
     image = photos(1, 21, dtype=torch.float64)
     image[..., :6] = 0.5 + 0.02 * image[..., :6]  # edges that are too weak
     options = {"scales": 4, "mode": mode, "saliency_weight": saliency_weight}
@@ -117,7 +113,7 @@ def test_multiscale_focus_curves_against_loops(
     np.testing.assert_allclose(got, want, atol=1e-9)
 
 
-def test_principal_curvature_image_against_scikit_image() -> None:
+def test_principal_curvature_image_against_scikit_image():
     image = photos(1, 33, dtype=torch.float64)
     for sign in (1.0, -1.0):
         got = filters.principal_curvature_image(sign * image, sigmas=(1.0, 2.0))[0]
@@ -130,7 +126,7 @@ def test_principal_curvature_image_against_scikit_image() -> None:
         np.testing.assert_allclose(np.hypot(*got.numpy()), want, atol=1e-12)
 
 
-def test_gaussian_gradient_saliency_and_second_derivatives_against_scipy_and_loops() -> None:
+def test_gaussian_gradient_saliency_and_second_derivatives_against_scipy_and_loops():
     image = photos(1, 33, dtype=torch.float64)
     x = filters.gaussian_smooth(image, 1.7)[0, 0].numpy()
     # scipy rounds the radius 4 sigma to the nearest pixel; gaussian_smooth rounds it up.
@@ -147,7 +143,7 @@ def test_gaussian_gradient_saliency_and_second_derivatives_against_scipy_and_loo
     np.testing.assert_allclose(yy[1:-1], np.diff(x, 2, axis=0), atol=1e-14)
 
 
-def test_dominant_eigenvector_against_lapack() -> None:
+def test_dominant_eigenvector_against_lapack():
     """(N, 2, 2) with real eigenvalues: adj(I_P) H_Z of random surfaces, and the boundaries between
     branches."""
     g = torch.Generator().manual_seed(0)
@@ -173,7 +169,7 @@ def test_dominant_eigenvector_against_lapack() -> None:
 
 
 @pytest.mark.parametrize("formula", ["geometric", "paper", "paper-length"])
-def test_direction_of_depth_curvilinear_saliency_against_lapack(formula: str) -> None:
+def test_direction_of_depth_curvilinear_saliency_against_lapack(formula):
     """The paper's is the eigenvector of the largest eigenvalue, ours of the largest in absolute
     value; M is written out as adj(I_P) H_Z."""
     depth = depths(1, 33, dtype=torch.float64)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from torch import Tensor
 
 from curvireg_torch.fitting.edges import CROP_SIZE, EdgeCrops
 from curvireg_torch.fitting.measured_fit import contour_evidence, contour_support
@@ -16,11 +15,11 @@ FRONT = transform(torch.eye(3).double(), torch.tensor([0.0, 0.0, 40.0]).double()
 BOX = torch.tensor([[40.0, 40.0, 160.0, 160.0]])
 
 
-def plate() -> trimesh.Trimesh:
+def plate():
     return trimesh.creation.box((1.0, 1.0, 0.02))
 
 
-def roof(*, ridges: int = 1) -> trimesh.Trimesh:
+def roof(*, ridges=1):
     """The plate with ridges towards the camera, which are creases within the outline."""
     x = np.linspace(-0.5, 0.5, 2 * ridges + 1)
     z = np.where(np.arange(len(x)) % 2 == 1, -0.4 / ridges, 0.0)
@@ -30,7 +29,7 @@ def roof(*, ridges: int = 1) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate(rows), faces, process=False)
 
 
-def photograph(*, line: float = 0.0, noise: float = 0.0) -> Tensor:
+def photograph(*, line=0.0, noise=0.0):
     """(3, 200, 200) a bright square where the plate is, its right half darker by ``line``."""
     image = torch.full((3, 200, 200), 0.2)
     image[:, 50:150, 50:150] = 0.8
@@ -39,7 +38,7 @@ def photograph(*, line: float = 0.0, noise: float = 0.0) -> Tensor:
     return (image + noise * torch.randn(image.shape, generator=generator)).clamp(0.0, 1.0)
 
 
-def measured(mesh: trimesh.Trimesh, image: Tensor, *T: Tensor) -> tuple[Tensor, Tensor]:
+def measured(mesh, image, *T):
     """Evidence and support of poses, by default that in front of the camera."""
     poses = torch.stack(T or (FRONT,))
     crops = EdgeCrops.cut([image], BOX, 0.1)

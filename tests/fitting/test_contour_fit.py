@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
 from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
@@ -32,25 +31,25 @@ class ParabolicEdges:
     """Edges of given heights at (E, P) distances in px along the normals: parabolas 1.5 px wide to
     both sides."""
 
-    def __init__(self, distances: Tensor, heights: list[float]) -> None:
+    def __init__(self, distances, heights):
         self.distances = distances
         self.heights = torch.tensor(heights, dtype=torch.float64)
 
-    def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, image_index: Tensor) -> Tensor:
+    def strength(self, uv, normals, offsets, image_index):
         apart = (offsets - self.distances[:, :, None]) / 1.5
         return (self.heights[:, None, None] * (1.0 - apart**2).clamp(min=0.0)).sum(dim=0)[None]
 
-    def counts(self, uv: Tensor, valid: Tensor, image_index: Tensor) -> Tensor:
+    def counts(self, uv, valid, image_index):
         return valid
 
 
-def problem(distances: Tensor, heights: list[float]) -> ContourProblem:
+def problem(distances, heights):
     contours: Any = SimpleNamespace(centre=CENTRE, radius=1.0)
     edges: Any = ParabolicEdges(distances, heights)
     return ContourProblem(contours, edges, FIRST, K[None], 128)
 
 
-def state(count: int, valid: int | None = None) -> ContourState:
+def state(count, valid=None):
     generator = torch.Generator().manual_seed(0)
     model = CENTRE + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
     normals = F.normalize(
@@ -60,11 +59,11 @@ def state(count: int, valid: int | None = None) -> ContourState:
     return ContourState(T, T, ContourPoints(model, normals, mask, mask))
 
 
-def at(count: int, *distances: float) -> Tensor:
+def at(count, *distances):
     return torch.tensor(distances, dtype=torch.float64)[:, None].expand(-1, count)
 
 
-def twist_of(one: ContourProblem, points: ContourPoints, radius: float) -> Tensor:
+def twist_of(one, points, radius):
     """(6,) by which a step moves the pose, to first order."""
     moved = one.step(points, T, radius)
     turn = moved[0, :3, :3] @ T[0, :3, :3].T
@@ -166,13 +165,13 @@ def test_edges_outside_the_photograph_do_not_count():
     assert float(inside[0, 0, :, 21:].max()) == 0.0
 
 
-def half_planes(*columns: int) -> ObjectMask:
+def half_planes(*columns):
     """For each column a crop of 256 px with the object to its left."""
     x = torch.arange(256)
     return ObjectMask(torch.stack([(x < column).float().expand(1, 256, 256) for column in columns]))
 
 
-def row_of_points(outline: bool, direction: float, *, count: int = 1) -> ContourPoints:
+def row_of_points(outline, direction, *, count=1):
     normals = torch.tensor([direction, 0.0], dtype=torch.float64).expand(count, 1, 2)
     there = torch.ones(count, 1, dtype=torch.bool)
     return ContourPoints(
@@ -296,7 +295,7 @@ def test_a_grey_photograph_counts_as_three_equal_channels():
     assert grey.transform.equal(colour.transform)
 
 
-def several() -> tuple[list[Tensor], Tensor, Tensor, Tensor, Tensor]:
+def several():
     """Three photographs of the cube with their own sizes and cameras, and five starts: two, two and
     one, shuffled."""
     generator = torch.Generator().manual_seed(0)

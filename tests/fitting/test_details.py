@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 import torch
 import trimesh
-from torch import Tensor
 
 from curvireg_torch.fitting import details
 from curvireg_torch.fitting.edges import EdgeCrops, EdgeField
@@ -21,7 +20,7 @@ TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
 
 
 @cache
-def marked_box(unit: float = 1.0) -> trimesh.Trimesh:
+def marked_box(unit=1.0):
     box = trimesh.creation.box((200, 120, 80))
     cube = trimesh.creation.box((30, 30, 30))
     cube.apply_translation((80, 0, 55))
@@ -30,7 +29,7 @@ def marked_box(unit: float = 1.0) -> trimesh.Trimesh:
     return mesh
 
 
-def compared(*, shift: float = 0.0, unit: float = 1.0, wrong: float = 0.0) -> tuple[Tensor, Tensor]:
+def compared(*, shift=0.0, unit=1.0, wrong=0.0):
     """Of the true pose, of its half turn, and of the true one again, whose place is ``wrong`` by a
     fraction of the radius."""
     mesh = marked_box(unit)
@@ -105,13 +104,13 @@ def test_contours_that_are_not_there_count_against_their_pose():
 
 
 def closed_case(
-    monkeypatch: pytest.MonkeyPatch,
-    places: list[list[float]],
+    monkeypatch,
+    places,
     *,
-    strength: float = 0.8,
-    padding: list[list[float]] | None = None,
-    outside: float = -1.0,
-) -> tuple[float, bool]:
+    strength=0.8,
+    padding=None,
+    outside=-1.0,
+):
     """Score of the first of two poses with contour points at ``places`` in px along a line, where
     all edges have a ``strength``; ``padding`` are places of points that are not valid, and at
     ``outside`` the photograph ends."""
@@ -138,7 +137,7 @@ def closed_case(
     return float(scores[0, 1]), bool(differ[0, 1])
 
 
-def line(start: float, count: int) -> list[float]:
+def line(start, count):
     return [start + 10.0 * k for k in range(count)]
 
 

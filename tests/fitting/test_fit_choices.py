@@ -14,25 +14,24 @@ from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.pipeline import FitSettings
-from curvireg_torch.registration import ContourFit
 from curvireg_torch.rendering.contours import MeshContours
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, silhouette
 
 Weigh = Callable[[ContourProblem, ContourState, Tensor], Tensor]
 
 
-def starts(*degrees: float) -> Tensor:
+def starts(*degrees):
     """Poses of the cube, turned about the y axis."""
     twist = torch.zeros(len(degrees), 6, dtype=torch.float64)
     twist[:, 1] = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
     return apply_twist(CUBE_POSE.repeat(len(degrees), 1, 1), twist, mesh_centre(cube()))
 
 
-def fitted(monkeypatch: pytest.MonkeyPatch, T: Tensor, weigh: Weigh, **options: Any) -> ContourFit:
+def fitted(monkeypatch, T, weigh, **options):
     """A fit to the cube where ``weigh`` gives the weighted support, from the plain one."""
     measure = ContourProblem.supports
 
-    def supports(problem: ContourProblem, state: ContourState) -> tuple[Tensor, Tensor]:
+    def supports(problem, state):
         plain, _ = measure(problem, state)
         return plain, weigh(problem, state, plain)
 
@@ -60,7 +59,7 @@ def test_the_starts_with_the_most_weighted_support_go_on(monkeypatch):
     went_on: list[Tensor] = []
     refined: list[Tensor] = []
 
-    def weigh(problem: ContourProblem, state: ContourState, plain: Tensor) -> Tensor:
+    def weigh(problem, state, plain):
         if problem.density == COARSE_DENSITY and not begun:
             begun.append(state.T)
             return torch.arange(len(plain), dtype=torch.float64)
@@ -68,7 +67,7 @@ def test_the_starts_with_the_most_weighted_support_go_on(monkeypatch):
 
     two_best = contour_fit._two_best
 
-    def watched(half: Any, fits: ContourState, supports: Tensor, index: Tensor) -> Any:
+    def watched(half, fits, supports, index):
         went_on.append(supports)
         plain, _ = half.supports(fits)
         refined.append(1.0 - plain)
@@ -77,7 +76,7 @@ def test_the_starts_with_the_most_weighted_support_go_on(monkeypatch):
     descend = ContourProblem.descend
     first: list[Tensor] = []
 
-    def descended(problem: ContourProblem, state: ContourState, radii: Any) -> ContourState:
+    def descended(problem, state, radii):
         first.append(state.T)
         return descend(problem, state, radii)
 
@@ -93,7 +92,7 @@ def test_a_start_that_is_not_finished_has_its_fit_if_that_is_better_by_weight(mo
     """Weights are a tenth of the plain support, which no fit reaches by weight."""
     given = starts(2.0, 6.0)
 
-    def weigh(_: ContourProblem, state: ContourState, plain: Tensor) -> Tensor:
+    def weigh(_, state, plain):
         near = (state.T - CUBE_POSE).flatten(1).norm(dim=1)
         return 0.1 * plain + torch.where(near < 1e-2, 0.01, 0.0)
 
@@ -105,13 +104,13 @@ def test_a_start_that_is_not_finished_has_its_fit_if_that_is_better_by_weight(mo
 class Half:
     """A problem where poses shift by their x, and stay where they are."""
 
-    def __getitem__(self, index: Tensor) -> "Half":
+    def __getitem__(self, index):
         return self
 
-    def mean_shift(self, points: Any, before: Tensor, after: Tensor) -> Tensor:
+    def mean_shift(self, points, before, after):
         return (after - before)[:, 0, 3].abs()
 
-    def descend(self, state: ContourState, radii: Any) -> ContourState:
+    def descend(self, state, radii):
         return state
 
 

@@ -24,6 +24,7 @@ from curvireg_torch.registration.hypotheses import fit_poses, placed
 from curvireg_torch.registration.photograph import as_photographs
 from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background
+from tests._support.quick import slow_after
 
 SIZE = (360, 480)
 K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
@@ -80,7 +81,7 @@ def box_of(T: torch.Tensor) -> torch.Tensor:
     return projected_boxes(extreme_points(mesh()), T[None], K)[0].float()
 
 
-@pytest.mark.parametrize("azimuth", [20.0, 130.0, 250.0])
+@pytest.mark.parametrize("azimuth", slow_after(1, [20.0, 130.0, 250.0]))
 @pytest.mark.parametrize("with_box", [True, False])
 def test_pose_is_that_of_the_print(azimuth, with_box):
     T = pose(azimuth, 0.4, 4.0)
@@ -249,7 +250,7 @@ def test_a_pose_outside_the_limits_is_no_start():
     other = pose(155.0, 0.4, 4.0)
     limits = cr.PosePrior(rotation=other[:3, :3], within=40.0)
     around = cr.Registrar(
-        mesh(), views=cr.sample_views(azimuth_step=30, elevations=[25]), mesh_is="exact"
+        mesh(), views=cr.sample_views(azimuth_step=60, elevations=[25]), mesh_is="exact"
     )
     result = around([photograph(T)], box_of(T)[None], K, prior=limits)[0]
     assert min(float(rotation_error(h.rotation, T[:3, :3])) for h in result.hypotheses) > 40.0
@@ -267,6 +268,7 @@ def test_meshes_without_colours_and_photographs_without_a_camera_have_no_keypoin
     assert len(poses) == len(count) == 0
 
 
+@pytest.mark.slow
 def test_boxes_of_keypoints_are_the_first_proposals_less_certain_with_a_rival():
     T = pose(65.0, 0.4, 4.0)
     item = as_photographs([photograph(T)], None, K)[0]

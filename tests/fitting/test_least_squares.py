@@ -25,7 +25,7 @@ def test_project_and_its_derivative():
     T = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None]
     centre = torch.tensor([0.4, 0.5, 0.6], dtype=torch.float64)
 
-    def moved(step: torch.Tensor) -> torch.Tensor:
+    def moved(step):
         uv, _ = ls.project(points, normals, ls.apply_twist(T, step[None], centre), K[None], centre)
         return (uv * normals).sum(dim=-1)[0]
 
@@ -119,7 +119,7 @@ def test_nearest_rigid_pose_is_orthogonal():
     torch.testing.assert_close(ls.nearest_rigid(drifted), T)
 
 
-def cloud(count: int) -> tuple[ContourPoints, torch.Tensor, torch.Tensor, torch.Tensor]:
+def cloud(count):
     """Points in a cube with random normals, a pose, the cube's centre, and the derivatives along
     the normals."""
     generator = torch.Generator().manual_seed(0)
@@ -142,7 +142,7 @@ def test_covariance_in_closed_form():
     C, known = ls.pose_covariance(ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
     assert int(known) == 6
 
-    def moved(step: torch.Tensor) -> torch.Tensor:
+    def moved(step):
         R = rotation_from_axis_angle(step[None, :3])[0] @ T[0, :3, :3]
         return project_points(points.model[0], transform(R, T[0, :3, 3] + step[3:]), K)
 

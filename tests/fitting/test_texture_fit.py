@@ -43,14 +43,14 @@ def renderer():
     return make_renderer(MESH)
 
 
-def turned_can(degrees: float) -> torch.Tensor:
+def turned_can(degrees):
     """The true pose, turned about the can's axis: its contours are the same."""
     twist = torch.zeros(1, 6, dtype=torch.float64)
     twist[0, :3] = float(np.radians(degrees)) * R[:, 1]
     return apply_twist(TRUTH, twist, CENTRE)
 
 
-def fit(renderer, image, starts, mesh=MESH) -> ContourFit | None:
+def fit(renderer, image, starts, mesh=MESH):
     def draw(T, K, size):
         return render_colour(mesh, T, K, size, renderer=renderer)
 
@@ -61,7 +61,7 @@ def fit(renderer, image, starts, mesh=MESH) -> ContourFit | None:
     )
 
 
-def error(found: ContourFit) -> float:
+def error(found):
     return float(rotation_error(found.transform[0, :3, :3], R))
 
 

@@ -13,7 +13,7 @@ from curvireg_torch.synthetic import example_mesh
 K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
 
 
-def test_project_points_agrees_with_opencv() -> None:
+def test_project_points_agrees_with_opencv():
     X = np.random.default_rng(0).uniform(-1, 1, (40, 3))
     rotation = np.array([0.3, -0.8, 0.2])
     t = np.array([0.2, -0.1, 5.0])
@@ -28,7 +28,7 @@ def test_project_points_agrees_with_opencv() -> None:
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3])
-def test_pose_from_box_recovers_the_true_pose(spread: float) -> None:
+def test_pose_from_box_recovers_the_true_pose(spread):
     """Of objects 3 to 12 radii away, ``spread`` (tangent) off the axis."""
     mesh = example_mesh()
     mesh.apply_translation([3.0, -2.0, 1.0])  # the centre is far from the origin
@@ -48,7 +48,7 @@ def test_pose_from_box_recovers_the_true_pose(spread: float) -> None:
         assert float((found_R @ centre + found_t - ray).norm() / ray.norm()) < 1e-4
 
 
-def test_pose_from_box_keeps_the_object_in_front_of_the_camera() -> None:
+def test_pose_from_box_keeps_the_object_in_front_of_the_camera():
     cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
     box = torch.tensor([-1e5, -1e5, 1e5, 1e5], dtype=torch.float64) + K[:2, 2].repeat(2)
     nearest = 1.05 * 3.0**0.5  # extents of the cube

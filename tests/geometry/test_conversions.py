@@ -9,7 +9,7 @@ from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
 
 
-def test_opengl_cameras_look_backward_with_y_up() -> None:
+def test_opengl_cameras_look_backward_with_y_up():
     R = torch.from_numpy(Rotation.random(7, random_state=0).as_matrix())
     T = g.transform(R, torch.tensor([0.2, -0.1, 5.0], dtype=torch.float64).expand(7, 3))
     flipped = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)) @ T
@@ -17,7 +17,7 @@ def test_opengl_cameras_look_backward_with_y_up() -> None:
     assert torch.equal(g.opencv_from_opengl(flipped), T)
 
 
-def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d() -> None:
+def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d():
     # p = diag(f, f, -1) Rx(e - 90) Rz(-a) (X - C), rotated by theta; v = py - y.
     X, f, (px, py) = np.random.default_rng(0).uniform(-1, 1, (50, 3)), 3000.0, (70.3, 51.8)
     for a, e, t, d in ((30.0, 20.0, -10.0, 5.0), (200.0, -35.0, 100.0, 4.0), (0.0, 0.0, 0.0, 9.0)):
@@ -42,7 +42,7 @@ def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d() -> Non
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-4, 1.0, math.pi - 1e-4, math.pi - 1e-8, math.pi])
-def test_axis_angle_agrees_with_scipy(angle: float) -> None:
+def test_axis_angle_agrees_with_scipy(angle):
     axes = np.random.default_rng(0).normal(size=(40, 3))
     vectors = axes / np.linalg.norm(axes, axis=1, keepdims=True) * angle
     R = Rotation.from_rotvec(vectors).as_matrix()
@@ -60,7 +60,7 @@ CONTINUOUS = {"symmetries_continuous": [{"axis": AXIS, "offset": OFFSET}]}
 HALF_TURN = [-1, 0, 0, 8, 0, -1, 0, 6, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
-def test_symmetry_transforms_reads_matrices_and_axes_and_refuses_malformed_input() -> None:
+def test_symmetry_transforms_reads_matrices_and_axes_and_refuses_malformed_input():
     assert torch.equal(
         g.symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None]
     )

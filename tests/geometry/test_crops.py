@@ -9,13 +9,13 @@ from curvireg_torch.geometry.crops import check_boxes, crop_squares, image_trans
 from curvireg_torch.utils.checks import check_camera_matrix
 
 
-def ramp(height: int, width: int) -> torch.Tensor:
+def ramp(height, width):
     """(1, 2, H, W): each pixel's x and y."""
     y, x = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
     return torch.stack([x, y])[None]
 
 
-def test_image_transforms_invert_crop_transforms_with_exact_zeros() -> None:
+def test_image_transforms_invert_crop_transforms_with_exact_zeros():
     # A camera matrix with 1e-16 in place of 0, which some versions of LAPACK leave, is refused.
     squares = torch.tensor([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]], dtype=torch.float64)
     back = image_transforms(squares, 32)
@@ -28,9 +28,7 @@ def test_image_transforms_invert_crop_transforms_with_exact_zeros() -> None:
 @pytest.mark.parametrize(
     ("side", "size", "off"), [(8.0, 8, 2e-4), (8.0, 16, 2e-4), (24.0, 8, 2e-4), (20.5, 12, 0.1)]
 )
-def test_crop_images_agrees_with_its_transforms_on_a_ramp(
-    side: float, size: int, off: float
-) -> None:
+def test_crop_images_agrees_with_its_transforms_on_a_ramp(side, size, off):
     # Bilinear weights preserve a ramp exactly, also if widened by an integer factor, else nearly.
     image = ramp(60, 80)
     box = torch.tensor([[30.2, 18.3, 30.2 + side, 18.3 + 0.5 * side]])
@@ -42,14 +40,14 @@ def test_crop_images_agrees_with_its_transforms_on_a_ramp(
 
 
 @pytest.mark.parametrize("side", [3.0, 9.5, 40.0, 200.0])
-def test_crop_squares_are_triangle_filtered(side: float) -> None:
+def test_crop_squares_are_triangle_filtered(side):
     image = torch.rand(2, 70, 90, dtype=torch.float64)
     size = 11
     corners = torch.tensor([[40.3, 31.2], [30.1, -1.7], [88.0, 60.0]], dtype=torch.float64)
     squares = torch.cat([corners, corners + torch.tensor([[side], [1.1 * side], [side]])], dim=1)
     crops = crop_squares(image, squares, size)
 
-    def weights(low: float, high: float, length: int) -> torch.Tensor:
+    def weights(low, high, length):
         scale = (high - low) / size
         centres = (low + (torch.arange(size) + 0.5).double() * scale).clamp(0, length - 1)
         w = (1.0 - (torch.arange(length) - centres[:, None]).abs() / max(scale, 1.0)).clamp(min=0.0)
@@ -59,7 +57,7 @@ def test_crop_squares_are_triangle_filtered(side: float) -> None:
         torch.testing.assert_close(crop, weights(y0, y1, 70) @ image @ weights(x0, x1, 90).mT)
 
 
-def test_check_boxes_refuses_boxes_without_pixels() -> None:
+def test_check_boxes_refuses_boxes_without_pixels():
     for box, match in (
         ([float("nan"), 0.0, 5.0, 5.0], "finite"),
         ([0.0, 0.0, 1e9, 5.0], r"beyond 1e\+06 px; give pixel coordinates of the 30 x 20"),
@@ -71,7 +69,7 @@ def test_check_boxes_refuses_boxes_without_pixels() -> None:
             check_boxes(torch.tensor([[0.0, 0.0, 5.0, 5.0], box]), [(20, 30), (20, 30)])
 
 
-def test_crop_images_spreads_missing_pixels_no_further_than_its_filter() -> None:
+def test_crop_images_spreads_missing_pixels_no_further_than_its_filter():
     image = torch.rand(1, 3, 60, 80)
     boxes = torch.tensor([[30.0, 20.0, 60.0, 50.0]])
     clean, _ = g.crop_images(image, boxes, size=32)

@@ -37,7 +37,7 @@ def test_rotations_have_the_type_of_the_tensors_and_of_numbers_alone_float64(ang
     torch.testing.assert_close(R.double(), exact, rtol=0, atol=4 * torch.finfo(dtype).eps)
 
 
-def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint() -> None:
+def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint():
     R = torch.from_numpy(Rotation.random(500, random_state=0).as_matrix())
     a, e, t = g.viewpoint_from_rotation(R)
     assert bool(((a >= 0) & (a < 360) & (e.abs() <= 90) & (t >= -180) & (t < 180)).all())
@@ -50,9 +50,7 @@ def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint() -> None:
 
 @pytest.mark.parametrize("elevation", [90.0, -90.0])
 @pytest.mark.parametrize("noise", [0.0, 1e-7, 1e-6, 1e-5, 1e-3])
-def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(
-    elevation: float, noise: float
-) -> None:
+def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(elevation, noise):
     """Rotations from an optimiser are rounded, and so not exact."""
     generator = torch.Generator().manual_seed(0)
     azimuth, theta = (
@@ -69,7 +67,7 @@ def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(
     assert math.radians(float(g.rotation_error(back.double(), rounded.double()).max())) < 5e-5
 
 
-def test_angles_of_all_pairs_are_those_of_the_nearest_symmetry() -> None:
+def test_angles_of_all_pairs_are_those_of_the_nearest_symmetry():
     R = torch.from_numpy(Rotation.random(5, random_state=1).as_matrix())
     others = torch.from_numpy(Rotation.random(7, random_state=2).as_matrix())
     group = torch.from_numpy(Rotation.create_group("C4").as_matrix())
@@ -81,7 +79,7 @@ def test_angles_of_all_pairs_are_those_of_the_nearest_symmetry() -> None:
     torch.testing.assert_close(angles_between(R, others, transforms), nearest)
 
 
-def test_rotation_error_agrees_with_scipy() -> None:
+def test_rotation_error_agrees_with_scipy():
     A = Rotation.random(60, random_state=1)
     differences = Rotation.from_rotvec(
         [[0, 0, v] for v in (0.0, 1e-9, 1e-4, 1.0, 3.0, math.pi)] * 10
@@ -98,7 +96,7 @@ def test_rotation_error_agrees_with_scipy() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 5, 20, 100, 300, 700])
-def test_uniform_views_has_the_stated_covering_radius(count: int) -> None:
+def test_uniform_views_has_the_stated_covering_radius(count):
     probes = torch.randn(
         100_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
@@ -111,7 +109,7 @@ def test_uniform_views_has_the_stated_covering_radius(count: int) -> None:
     assert 0.9 * 157 / math.sqrt(count) < radius <= 157 / math.sqrt(count)
 
 
-def test_paper_views_is_the_grid_of_the_paper() -> None:
+def test_paper_views_is_the_grid_of_the_paper():
     views = paper_views()
     assert len(views) == 756
     assert sorted({round(float(d), 4) for d in views.distance}) == pytest.approx(
@@ -129,7 +127,7 @@ def test_paper_views_is_the_grid_of_the_paper() -> None:
     assert torch.allclose(step[..., 0, 0], torch.tensor(1.0), atol=1e-5)
 
 
-def test_view_functions_refuse_invalid_options() -> None:
+def test_view_functions_refuse_invalid_options():
     one = torch.zeros(1)
     for call, match in (
         (lambda: ViewSphere(one, one, one, one + 1), "distances > 1"),
@@ -147,7 +145,7 @@ def test_view_functions_refuse_invalid_options() -> None:
 
 
 @pytest.mark.parametrize("up", UP_AXES)
-def test_for_up_shows_the_same_views(up: str) -> None:
+def test_for_up_shows_the_same_views(up):
     assert (up_rotation("y").numpy() @ [0, 0, 1]).tolist() == [0, -1, 0], (
         "from glTF's front to that of PASCAL3D+"
     )

@@ -73,6 +73,7 @@ def test_register_takes_pictures_of_other_kinds(folder, result):
             assert same.rotation.equal(result.rotation)
 
 
+@pytest.mark.slow
 def test_register_detects_the_object_without_a_box(folder):
     found = cr.register(
         folder / "photos" / "0.png", learned_registrar(), camera=tuple(map(float, CAMERA))

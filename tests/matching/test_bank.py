@@ -29,7 +29,7 @@ from tests._support.scenes import learned_registrar, scene
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
 
 
-def build(mesh, views=None, **options) -> ViewBank:
+def build(mesh, views=None, **options):
     return ViewBank.build(mesh, views, progress=False, image_size=64, **options)
 
 
@@ -45,7 +45,7 @@ def rewrite(path, tensors, **metadata):
     save_file(tensors, path, {**original, **metadata})
 
 
-def assert_same(a: ViewBank, b: ViewBank, *, atol: float = 0.0) -> None:
+def assert_same(a, b, *, atol=0.0):
     torch.testing.assert_close(a.descriptors, b.descriptors, rtol=0, atol=atol)
     for name in ("points_at", "silhouettes_at"):
         assert torch.equal(getattr(a, name)(slice(None)), getattr(b, name)(slice(None)))

@@ -22,16 +22,16 @@ PIPELINE = Pipeline(bank=BankSettings(image_size=64))
 VIEWS = sample_views(azimuth_step=90, elevations=[20])
 
 
-def cached_box(folder: Path | None, edge: float = 1.0, **options) -> ViewBank:
+def cached_box(folder, edge=1.0, **options):
     mesh = trimesh.creation.box((edge, 1.0, 1.0))
     return cached_bank(mesh, VIEWS, pipeline=PIPELINE, folder=folder, progress=False, **options)
 
 
-def key(mesh: trimesh.Trimesh, views=VIEWS, **options) -> str:
+def key(mesh, views=VIEWS, **options):
     return bank_key(mesh, views, **{"pipeline": PIPELINE, **options})
 
 
-def textured(*, uv: float = 0.0, level: int = 0, side: int = 4) -> trimesh.Trimesh:
+def textured(*, uv=0.0, level=0, side=4):
     """A box with a texture of 16 pixels and texture coordinates that float16 cannot represent."""
     mesh = trimesh.creation.box()
     pixels = np.arange(48, dtype=np.uint8).reshape(side, 16 // side, 3) + np.uint8(level)
@@ -40,7 +40,7 @@ def textured(*, uv: float = 0.0, level: int = 0, side: int = 4) -> trimesh.Trime
     return mesh
 
 
-def standing(up: str = "y") -> trimesh.Trimesh:
+def standing(up="y"):
     mesh = trimesh.creation.box()
     mesh.metadata["up"] = up
     return mesh
@@ -182,7 +182,7 @@ def test_cached_bank_warns_of_an_unwritable_folder(tmp_path):
     assert (list_cache(tmp_path / "file"), clear_cache(tmp_path / "file")) == ([], 0)
 
 
-def _build_all(folder: str, edges: tuple[float, ...]) -> float:
+def _build_all(folder, edges):
     torch.set_num_threads(1)
     return sum(float(cached_box(Path(folder), edge).descriptors.sum()) for edge in edges)
 

@@ -17,11 +17,11 @@ from tests._support.scenes import scene
 
 
 @pytest.fixture(scope="module")
-def matcher(bank) -> ViewMatcher:
+def matcher(bank):
     return ViewMatcher(bank)
 
 
-def batch(*seeds: int) -> tuple[torch.Tensor, torch.Tensor]:
+def batch(*seeds):
     return torch.stack([scene(s)[0] for s in seeds]), torch.stack([scene(s)[1] for s in seeds])
 
 

@@ -8,12 +8,12 @@ import trimesh
 from curvireg_torch.mesh.edges import MAX_EDGE_FACES, MeshEdges, occluding_edges, simplified
 
 
-def edges_of(vertices: object, faces: object) -> MeshEdges:
+def edges_of(vertices, faces):
     mesh = trimesh.Trimesh(np.array(vertices, float), np.array(faces), process=False)
     return MeshEdges(mesh, np.zeros(3), max_faces=10_000)
 
 
-def at(edges: MeshEdges, a: tuple[float, ...], b: tuple[float, ...]) -> int:
+def at(edges, a, b):
     """The number of the edge between two places."""
     places = [tuple(place) for place in edges.vertices.round(6).tolist()]
     wanted = {places.index(a), places.index(b)}
@@ -21,12 +21,12 @@ def at(edges: MeshEdges, a: tuple[float, ...], b: tuple[float, ...]) -> int:
     return found
 
 
-def on_contour(edges: MeshEdges, eye: np.ndarray) -> np.ndarray:
+def on_contour(edges, eye):
     all_same, _ = occluding_edges(torch.from_numpy(edges.side_planes()), torch.from_numpy(eye))
     return all_same.numpy()
 
 
-def fan(angles: list[float]) -> MeshEdges:
+def fan(angles):
     """Pages of a book, open by these angles in degrees, around the z axis."""
     outer = [(np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.5) for angle in angles]
     faces = [[0, 1, 2 + k] if k % 2 else [1, 0, 2 + k] for k in range(len(angles))]
@@ -50,7 +50,7 @@ SPINE = ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
         ([0], False, False),  # a boundary
     ],
 )
-def test_what_an_edge_is(angles: list[float], is_crease: bool, is_smooth: bool) -> None:
+def test_what_an_edge_is(angles, is_crease, is_smooth):
     edges = fan(angles)
     spine = at(edges, *SPINE)
     assert (bool(edges.is_crease[spine]), bool(edges.is_smooth[spine])) == (is_crease, is_smooth)
@@ -59,7 +59,7 @@ def test_what_an_edge_is(angles: list[float], is_crease: bool, is_smooth: bool) 
 @pytest.mark.parametrize(
     ("azimuth", "expected"), [(45.0, False), (-45.0, False), (135.0, False), (-135.0, False)]
 )
-def test_the_faces_of_an_edge_are_all_looked_at(azimuth: float, expected: bool) -> None:
+def test_the_faces_of_an_edge_are_all_looked_at(azimuth, expected):
     """Four pages, every quarter turn: from nowhere do all of them lie on one side of the spine. The
     first two do."""
     assert MAX_EDGE_FACES >= 4
@@ -69,7 +69,7 @@ def test_the_faces_of_an_edge_are_all_looked_at(azimuth: float, expected: bool) 
     assert bool(all_same[0, at(edges, *SPINE)]) == expected
 
 
-def test_the_contour_of_a_book_is_its_spine_where_all_pages_lie_on_one_side() -> None:
+def test_the_contour_of_a_book_is_its_spine_where_all_pages_lie_on_one_side():
     edges = fan([10.0, 30.0, 50.0, 80.0])
     seen = [np.degrees(azimuth) for azimuth in np.radians(np.arange(0, 360, 5) + 2.5)]
     eyes = (
@@ -87,7 +87,7 @@ def test_the_contour_of_a_book_is_its_spine_where_all_pages_lie_on_one_side() ->
     assert found == expected
 
 
-def test_simplification_keeps_the_number_of_faces_that_is_asked_for() -> None:
+def test_simplification_keeps_the_number_of_faces_that_is_asked_for():
     sphere = trimesh.creation.icosphere(subdivisions=5)
     for most in (1000, 5000):
         vertices, faces = simplified(sphere, np.zeros(3), most)
@@ -98,7 +98,7 @@ def test_simplification_keeps_the_number_of_faces_that_is_asked_for() -> None:
 
 @pytest.mark.parametrize("unit", [1.0, 1e-3, 1e3])
 @pytest.mark.parametrize(("gap", "edges"), [(1e-8, 5), (1e-4, 6)])
-def test_vertices_at_the_same_place_are_one(unit: float, gap: float, edges: int) -> None:
+def test_vertices_at_the_same_place_are_one(unit, gap, edges):
     """Two triangles of a square; their gap is a fraction of its side."""
     corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (gap, gap, 0), (1, 1 + gap, 0), (0, 1, 0)])
     found = edges_of(unit * corners, [[0, 1, 2], [3, 4, 5]])
@@ -106,7 +106,7 @@ def test_vertices_at_the_same_place_are_one(unit: float, gap: float, edges: int)
 
 
 @pytest.mark.parametrize("flipped", [False, True])
-def test_doubled_faces_count_once(flipped: bool) -> None:
+def test_doubled_faces_count_once(flipped):
     corners = [(0, 0, 0), (0, 0, 1), (1, 0, 0.5), (-1, 0, 0.5)]
     faces = [[1, 0, 2], [0, 1, 3]]
     again = [face[::-1] for face in faces] if flipped else faces

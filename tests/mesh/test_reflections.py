@@ -22,7 +22,7 @@ def test_plane_is_that_to_which_a_mesh_is_most_nearly_symmetric():
     assert abs(float(plane[1])) > 0.95, "but for its mast, the ship is symmetric from side to side"
 
 
-def test_a_knob_at_one_corner_is_no_symmetry() -> None:
+def test_a_knob_at_one_corner_is_no_symmetry():
     """Most points of the surface have a mirror image: the few that have none count."""
     knob = trimesh.creation.box((0.2, 0.2, 0.2))
     knob.apply_translation([0.55, 0.7, 0.9])

@@ -9,7 +9,7 @@ from curvireg_torch.mesh.round_axis import round_axis
 from tests._support.canisters import canister
 
 
-def handled_mug() -> trimesh.Trimesh:
+def handled_mug():
     handle = trimesh.creation.torus(0.9, 0.25)
     handle.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
     handle.apply_translation((1.2, 0.0, 0.0))

@@ -63,6 +63,7 @@ def test_distorted_photograph_gives_the_pose_of_the_true_camera(camera, seed):
     assert errors(ignored, T)[1] > 0.02  # so the photograph needs it
 
 
+@pytest.mark.slow
 def test_detection_refinement_and_following_take_cameras():
     _, photo, box, _, T = distorted(RADIAL, 0)
     register = truck_registrar()

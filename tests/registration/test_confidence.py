@@ -15,6 +15,7 @@ from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import confidence
 from curvireg_torch.synthetic import procedural_background
+from tests._support.quick import slow_after
 from tests._support.scenes import (
     CAMERA,
     SIZE,
@@ -27,7 +28,7 @@ from tests._support.scenes import (
 R30 = sample_views(azimuth_step=12, elevations=[0]).rotations
 
 
-def scores_of(values: dict[int, float], others: float) -> torch.Tensor:
+def scores_of(values, others):
     return torch.tensor([values.get(view, others) for view in range(30)])
 
 
@@ -241,7 +242,7 @@ def test_confidence_is_higher_for_the_object_than_for_clutter():
     assert sum(r.confidence >= confidence.RELIABLE for r in there) >= 4
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_after(1, range(3)))
 def test_confidence_does_not_depend_on_the_number_of_reported_hypotheses(seed):
     image, box, _ = scene(seed)
     bank = learned_registrar().bank

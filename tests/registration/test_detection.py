@@ -86,7 +86,10 @@ def pasted_camera(corner, scale):
     return K
 
 
-@pytest.mark.parametrize(("seed", "corner", "scale"), [(5, (30, 60), 0.6), (7, (40, 10), 1.1)])
+@pytest.mark.parametrize(
+    ("seed", "corner", "scale"),
+    [(5, (30, 60), 0.6), pytest.param(7, (40, 10), 1.1, marks=pytest.mark.slow)],
+)
 def test_detected_pose_is_the_true_one(seed, corner, scale):
     """Pasted elsewhere at another scale; the camera of the scene is transformed accordingly."""
     image, box = pasted_scene(seed, corner, scale)
@@ -98,6 +101,7 @@ def test_detected_pose_is_the_true_one(seed, corner, scale):
     assert (result.translation - truth[:3, 3]).norm() < 0.05 * truth[:3, 3].norm()
 
 
+@pytest.mark.slow
 def test_an_object_that_the_detector_overlooks_is_lost_and_not_placed_elsewhere():
     """Of six such scenes four are right within five degrees and two are not found, this one among
     them; in its box it is right."""

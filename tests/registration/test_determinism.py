@@ -1,23 +1,21 @@
 """A result depends on its batch and on the number of threads by rounding alone, and not on what was
 registered before."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
-from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import CAMERA, scene
+from tests._support.scenes import CAMERA, scene, unrefined
 
 IMAGES = [scene(seed)[0] for seed in (0, 1)]
 BOXES = torch.stack([scene(seed)[1] for seed in (0, 1)])
 
 
 @pytest.fixture(scope="module")
-def bank() -> ViewBank:
+def bank():
     """The default pipeline; the appearance of views is described on demand, as in large banks."""
     views = sample_views(azimuth_step=30, elevations=[0, 30, 60])
     pipeline = Pipeline().with_term("appearance", exhaustive_limit=10, top=8)
@@ -27,7 +25,7 @@ def bank() -> ViewBank:
     return ViewBank.build(example_mesh(), views, pipeline=pipeline, progress=False)
 
 
-def numbers(result: Registration) -> list[torch.Tensor]:
+def numbers(result):
     """Everything in a result, as tensors."""
     poses = [
         t
@@ -48,14 +46,14 @@ def numbers(result: Registration) -> list[torch.Tensor]:
     ]
 
 
-def check_agreement(one: Registration, other: Registration) -> None:
+def check_agreement(one, other):
     """To .05 degrees, and .01 of confidence."""
     assert float(rotation_error(one.rotation, other.rotation)) < 0.05
     assert other.confidence == pytest.approx(one.confidence, abs=0.01)
     assert other.verdict == one.verdict
 
 
-def test_runs_of_the_same_call_are_bit_identical(bank: ViewBank) -> None:
+def test_runs_of_the_same_call_are_bit_identical(bank):
     """What was registered before does not matter."""
     first = Registrar(bank)(IMAGES, BOXES, CAMERA)
     registrar = Registrar(bank)
@@ -64,9 +62,7 @@ def test_runs_of_the_same_call_are_bit_identical(bank: ViewBank) -> None:
         assert all(map(torch.equal, numbers(one), numbers(other)))
 
 
-def test_a_photograph_alone_agrees_with_that_of_a_batch(
-    bank: ViewBank, threads: Callable[[int], None]
-) -> None:
+def test_a_photograph_alone_agrees_with_that_of_a_batch(bank, threads):
     threads(1)
     alone = [Registrar(bank)([i], b[None], CAMERA)[0] for i, b in zip(IMAGES, BOXES, strict=True)]
     threads(3)
@@ -74,12 +70,12 @@ def test_a_photograph_alone_agrees_with_that_of_a_batch(
         check_agreement(one, other)
 
 
-def test_a_detection_alone_agrees_with_that_of_a_batch(
-    bank: ViewBank, threads: Callable[[int], None]
-) -> None:
+@pytest.mark.parametrize("fitted", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_detection_alone_agrees_with_that_of_a_batch(bank, threads, fitted):
+    pipeline = bank.pipeline if fitted else unrefined(bank)
     threads(1)
-    alone = Registrar(bank)(IMAGES[1:])[0]
+    alone = Registrar(bank, pipeline=pipeline)(IMAGES[1:])[0]
     threads(2)
-    together = Registrar(bank)(IMAGES)[1]
+    together = Registrar(bank, pipeline=pipeline)(IMAGES)[1]
     torch.testing.assert_close(alone.detection.boxes, together.detection.boxes)
     check_agreement(alone, together)

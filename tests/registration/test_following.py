@@ -16,6 +16,7 @@ from curvireg_torch.geometry.cameras import pose_around
 from curvireg_torch.registration import FailedRegistration, Follower, refine, tracking
 from curvireg_torch.registration.tracking import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
+from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, sequence, truck_registrar
 
 LOST = Mock(side_effect=LostObjectError("lost"))
@@ -66,7 +67,7 @@ def answering(monkeypatch, registrar, answers):
     monkeypatch.setattr(type(registrar), "__call__", call)
 
 
-@pytest.mark.parametrize("first", [0.015, BELIEVED_CONFIDENCE - 0.01])
+@pytest.mark.parametrize("first", slow_after(1, [BELIEVED_CONFIDENCE - 0.01, 0.015]))
 def test_a_pose_that_is_not_believed_is_not_followed(monkeypatch, first):
     """It is registered again in the next frames, and no confidence rises by being followed."""
     frames = sequence(4)
@@ -101,7 +102,7 @@ def test_registrations_that_agree_are_followed_without_more_confidence(
         assert (degrees < 4.0, position < 0.04) == (True, True)
 
 
-@pytest.mark.parametrize(("degrees", "part"), [(16.0, 0.0), (0.0, 0.11)])
+@pytest.mark.parametrize(("degrees", "part"), slow_after(1, [(16.0, 0.0), (0.0, 0.11)]))
 def test_registrations_that_disagree_are_not_followed(monkeypatch, degrees, part):
     """The second is turned about the object's centre, or moved by a part of its distance."""
     (image, box, _) = sequence(1)[0]
@@ -155,7 +156,7 @@ def test_confidence_is_a_fraction_of_that_of_the_first_pose_and_not_raised_by_th
 
 def test_a_wrong_start_never_becomes_believed():
     """Seen from behind, in frame after frame; a registration of each frame does not confirm it."""
-    frames = sequence(3)
+    frames = sequence(2)
     behind = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
     follow = Follower(learned_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2] @ behind)
@@ -186,6 +187,7 @@ def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
     assert follow(frames[4][0]).confidence > BELIEVED_CONFIDENCE, "tracked from the confirmed pose"
 
 
+@pytest.mark.slow
 def test_dark_frame_keeps_or_doubts_the_pose():
     """A frame at a third of the brightness is followed, or its confidence falls below what is
     believed."""

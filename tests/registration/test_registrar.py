@@ -309,7 +309,8 @@ def test_covariance_needs_a_reliable_result_and_a_camera(limit):
 def test_progress_reports_stages_and_may_cancel(monkeypatch):
     views = sample_views(azimuth_step=90, elevations=[0, 30])
     calls = []
-    pipeline = replace(PRESETS["classical"], hypotheses=1)
+    classical = PRESETS["classical"]
+    pipeline = replace(classical, hypotheses=1, detection=replace(classical.detection, proposals=1))
     options = {"pipeline": pipeline, "image_size": 64, "progress": lambda *call: calls.append(call)}
     monkeypatch.setattr("curvireg_torch.matching.bank.TURNS", 3)
     monkeypatch.setattr("curvireg_torch.matching.bank.PIXELS_AT_A_TIME", 1)

@@ -5,15 +5,15 @@ from functools import cache
 
 import pytest
 import torch
-from torch import Tensor
 
-from curvireg_torch import Registrar, Registration, rotation_error, rotation_from_viewpoint
+from curvireg_torch import Registrar, rotation_error, rotation_from_viewpoint
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import rig as rig_module
 from curvireg_torch.registration.rig import Rig
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
+from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, learned_registrar
 
 EASY = ((100.0, 1), (135.0, 2), (175.0, 3))
@@ -27,7 +27,7 @@ WORLD = transform(TURN, torch.tensor([0.2, 0.1, -0.4]).double())
 
 
 @cache
-def photograph(azimuth: float, seed: int, noise: float) -> tuple[Tensor, Tensor, Tensor]:
+def photograph(azimuth, seed, noise):
     """(3, H, W), its box (4,) and the true ``T_cam_from_model``, from six radii away and slightly
     above."""
     generator = torch.Generator().manual_seed(seed)
@@ -39,19 +39,17 @@ def photograph(azimuth: float, seed: int, noise: float) -> tuple[Tensor, Tensor,
     return (image + noise * torch.randn(image.shape, generator=generator)).clamp(0, 1), box, T
 
 
-def rig_of(
-    which: tuple[tuple[float, int], ...], noise: float = 0.1
-) -> tuple[list[Tensor], list[Tensor], Tensor]:
+def rig_of(which, noise=0.1):
     """Photographs, boxes, and ``T_cam_from_world`` (V, 4, 4)."""
     images, boxes, poses = zip(*(photograph(*one, noise) for one in which), strict=True)
     return list(images), list(boxes), torch.stack(poses) @ torch.linalg.inv(WORLD)
 
 
-def registered(images: list, boxes: list | None, cameras: Tensor) -> Registration:
+def registered(images, boxes, cameras):
     return learned_registrar().register_views(images, boxes, CAMERA, cameras)
 
 
-def check_pose(result: Registration, *, degrees: float = 2.0, shift: float = 0.1) -> None:
+def check_pose(result, *, degrees=2.0, shift=0.1):
     """``T_world_from_model`` is right, ``shift`` in radii."""
     assert float(rotation_error(result.rotation, WORLD[:3, :3])) < degrees
     off = result.translation - WORLD[:3, 3]
@@ -59,7 +57,7 @@ def check_pose(result: Registration, *, degrees: float = 2.0, shift: float = 0.1
 
 
 @pytest.fixture(scope="module")
-def easy() -> Registration:
+def easy():
     return registered(*rig_of(EASY))
 
 
@@ -86,7 +84,7 @@ def test_photographs_prefer_a_pose_without_rivals_by_all_points(monkeypatch):
 
 @pytest.mark.parametrize(
     ("first", "wrong", "degrees"),
-    [((40.0, 104), 2, 3.0), ((335.0, 102), 3, 10.0)],
+    slow_after(1, [((335.0, 102), 3, 10.0), ((40.0, 104), 2, 3.0)]),
 )
 def test_half_turns_in_doubt_are_decided_together(first, wrong, degrees):
     """Views of the two ends differ by half a turn, but not of the same world: only the truth is
@@ -126,10 +124,13 @@ def test_photographs_that_fail_are_reported_and_change_nothing(easy, tmp_path):
     more = torch.stack(
         [T @ torch.linalg.inv(WORLD), photograph(220.0, 4, 0.1)[2] @ torch.linalg.inv(WORLD)]
     )
+    away = transform(HALF_TURN, torch.zeros(3).double()) @ cameras[:1]  # looks the other way
     result = registered(
-        [*images, empty, tmp_path / "none.png"], [*boxes, box, box], torch.cat([cameras, more])
+        [*images, empty, tmp_path / "none.png", other],
+        [*boxes, box, box, box],
+        torch.cat([cameras, more, away]),
     )
-    assert [view.failure is None for view in result.views] == [True, True, True, False, False]
+    assert [view.failure is None for view in result.views] == [True] * 3 + [False] * 3
     assert "not seen where" in result.views[3].failure or "lies outside" in result.views[3].failure
     assert "no such file" in result.views[4].failure
     assert result.views[4].box is None
@@ -138,26 +139,21 @@ def test_photographs_that_fail_are_reported_and_change_nothing(easy, tmp_path):
     torch.testing.assert_close(
         result.views[4].T_cam_from_model, more[1] @ easy.transform, atol=1e-6, rtol=0
     )
-    away = transform(HALF_TURN, torch.zeros(3).double()) @ cameras[:1]
-    # it looks the other way
-    result = registered([*images, other], [*boxes, box], torch.cat([cameras, away]))
-    assert [view.failure is None for view in result.views] == [True, True, True, False]
-    check_pose(result, degrees=1.0, shift=0.05)
     shown = registered([*images, other], [*boxes, box], torch.cat([cameras, more[:1]]))
     assert all(view.failure is None for view in shown.views)
 
 
 def test_boxes_may_be_missing():
     images, boxes, cameras = rig_of(EASY)
-    result = registered(images, [boxes[0], None, boxes[2]], cameras)
+    other = photograph(60.0, 4, 0.1)[0]
+    away = transform(HALF_TURN, torch.zeros(3).double()) @ cameras[:1]  # looks the other way
+    result = registered(
+        [*images, other], [boxes[0], None, boxes[2], None], torch.cat([cameras, away])
+    )
     check_pose(result, degrees=1.0, shift=0.05)
     assert result.views[1].failure is None
     assert float((result.views[1].box - boxes[1]).abs().max()) < 8
-    away = cameras.clone()
-    away[1, :3] = HALF_TURN @ cameras[1, :3]  # looks the other way
-    result = registered(images, [boxes[0], None, boxes[2]], away)
-    check_pose(result, degrees=1.0, shift=0.05)
-    assert "lies outside" in result.views[1].failure
+    assert "lies outside" in result.views[3].failure
 
 
 @pytest.mark.slow
@@ -211,7 +207,7 @@ def test_a_motion_of_the_world_moves_the_answer(easy):
     assert moved.confidence == pytest.approx(easy.confidence, abs=1e-3)
 
 
-def in_another_unit(T: Tensor, factor: float) -> Tensor:
+def in_another_unit(T, factor):
     return transform(T[:, :3, :3], factor * T[:, :3, 3])
 
 
@@ -263,7 +259,7 @@ def test_copies_of_a_photograph_are_no_evidence():
 
 def test_rigs_compare_rivals_that_are_not_reported():
     """Of each photograph five, though one is reported."""
-    images, boxes, cameras = rig_of(IN_DOUBT, noise=0.3)
+    images, boxes, cameras = rig_of(IN_DOUBT[:2], noise=0.3)
     bank = learned_registrar().bank
     results = []
     for hypotheses in (1, 5):

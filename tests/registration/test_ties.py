@@ -15,6 +15,7 @@ from curvireg_torch.mesh import mesh_centre, mesh_radius, mesh_symmetries
 from curvireg_torch.mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from curvireg_torch.registration.target import MAX_SIBLINGS, spread, telling_symmetries
 from curvireg_torch.synthetic import synthesize_photograph
+from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE
 
 
@@ -70,7 +71,8 @@ def registered(
 
 
 @pytest.mark.parametrize(
-    ("azimuth", "elevation", "seed"), [(35.0, 25.0, 0), (160.0, 40.0, 1), (250.0, 15.0, 2)]
+    ("azimuth", "elevation", "seed"),
+    slow_after(1, [(35.0, 25.0, 0), (160.0, 40.0, 1), (250.0, 15.0, 2)]),
 )
 def test_half_turn_that_nothing_in_view_decides_is_named_and_not_reliable(azimuth, elevation, seed):
     assert len(mesh_symmetries(hollow_box())) == 1
@@ -103,7 +105,7 @@ def test_symmetric_mesh_without_given_symmetries_is_ambiguous():
     assert result.confidence <= 0.5
 
 
-@pytest.mark.parametrize("azimuth", [20.0, 75.0, 140.0, 200.0, 310.0])
+@pytest.mark.parametrize("azimuth", slow_after(2, [20.0, 140.0, 75.0, 200.0, 310.0]))
 def test_poses_that_the_shape_makes_equal_are_rivals_where_a_small_feature_differs(azimuth):
     mesh = marked_box()
     assert len(mesh_symmetries(mesh)) == 4

@@ -1,11 +1,8 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 import trimesh
 from PIL import Image
-from torch import Tensor
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import has_colours, load_mesh, surface_colours
@@ -24,14 +21,14 @@ SIZE = (72, 96)
 K = torch.tensor([[150.0, 0, 47.5], [0, 150.0, 35.5], [0, 0, 1]], dtype=torch.float64)
 
 
-def camera(azimuth: float, elevation: float, theta: float = 0.0, distance: float = 5.0) -> Tensor:
+def camera(azimuth, elevation, theta=0.0, distance=5.0):
     R = rotation_from_viewpoint(
         *(torch.tensor([a], dtype=torch.float64) for a in (azimuth, elevation, theta))
     )
     return transform(R, torch.tensor([[0.0, 0.0, distance]], dtype=torch.float64))
 
 
-def textured_box() -> trimesh.Trimesh:
+def textured_box():
     """A box whose six sides show six stripes of one texture; the left and the lower half of each
     are darker."""
     picture = np.zeros((16, 6 * 32, 3), np.uint8)
@@ -56,7 +53,7 @@ def textured_box() -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
 
 
-def expected_albedo(points: np.ndarray) -> np.ndarray:
+def expected_albedo(points):
     """Colour of points on the box, from their side and halves."""
     side = np.abs(points).argmax(axis=1)
     index = np.arange(len(points))
@@ -67,9 +64,7 @@ def expected_albedo(points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("view", [(20.0, 30.0, 0.0), (140.0, -40.0, 25.0), (260.0, 10.0, -70.0)])
-def test_render_colour_shows_the_texture_of_every_side(
-    view: tuple[float, float, float], orthographic: bool
-) -> None:
+def test_render_colour_shows_the_texture_of_every_side(view, orthographic):
     mesh = textured_box()
     T = camera(*view)
     intrinsics = K.clone()
@@ -102,7 +97,7 @@ def test_render_colour_shows_the_texture_of_every_side(
     assert picture[0, 0].tolist() == [1.0, 1.0, 1.0]
 
 
-def test_render_colour_is_grey_without_colours_or_faces() -> None:
+def test_render_colour_is_grey_without_colours_or_faces():
     mesh = textured_box()
     T = camera(20.0, 30.0)
     bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -114,7 +109,7 @@ def test_render_colour_is_grey_without_colours_or_faces() -> None:
     assert render_colour(mesh, T[:0], K, SIZE).shape == (0, 3, *SIZE)
 
 
-def test_cleaning_preserves_vertex_and_face_colours() -> None:
+def test_cleaning_preserves_vertex_and_face_colours():
     box = trimesh.creation.box()
     # cleaning removes the degenerate face, which shifts the others
     faces = np.concatenate([[[0, 0, 1]], box.faces])
@@ -137,7 +132,7 @@ def test_cleaning_preserves_vertex_and_face_colours() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
-def test_load_mesh_reads_textures_and_materials(tmp_path: Path, suffix: str) -> None:
+def test_load_mesh_reads_textures_and_materials(tmp_path, suffix):
     red = trimesh.creation.box((0.4, 0.4, 0.4))
     material = trimesh.visual.material
     # Factors of glTF are linear: 0.2 of it is 124 of sRGB.
@@ -176,7 +171,7 @@ def test_load_mesh_reads_textures_and_materials(tmp_path: Path, suffix: str) -> 
     )
 
 
-def test_load_mesh_warns_of_a_damaged_texture(tmp_path: Path) -> None:
+def test_load_mesh_warns_of_a_damaged_texture(tmp_path):
     textured_box().export(tmp_path / "box.obj")
     picture = next(p for p in tmp_path.iterdir() if p.suffix in (".png", ".jpg", ".jpeg"))
     picture.write_bytes(picture.read_bytes()[: picture.stat().st_size // 2])

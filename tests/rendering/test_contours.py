@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from torch import Tensor
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.rendering.contours import (
     MAX_OCCLUDING,
-    ContourPoints,
     MeshContours,
     _spread_evenly,
 )
@@ -20,7 +18,7 @@ from curvireg_torch.rendering.contours import (
 K = torch.tensor([[220.0, 0, 63.5], [0, 220.0, 63.5], [0, 0, 1]], dtype=torch.float64)
 
 
-def stairs(unit: float) -> trimesh.Trimesh:
+def stairs(unit):
     """Two boxes of different heights that touch, and a flat sphere beside them."""
     parts = [trimesh.creation.box((2.0, 1.2, height)) for height in (0.5, 0.9)]
     parts[1].apply_translation((0.0, 1.2, 0.2))
@@ -32,7 +30,7 @@ def stairs(unit: float) -> trimesh.Trimesh:
 
 
 @cache
-def poses() -> Tensor:
+def poses():
     """(4, 4, 4) around the mesh in units, 5 to 8 away."""
     T = []
     for azimuth, elevation, distance in ((20, 25, 5), (110, 40, 6), (200, 10, 7), (290, 60, 8)):
@@ -42,7 +40,7 @@ def poses() -> Tensor:
 
 
 @cache
-def contour_points(unit: float) -> ContourPoints:
+def contour_points(unit):
     T = poses().clone()
     T[:, :3, 3] *= unit
     return MeshContours(stairs(unit)).points(T, K[None], 128)

@@ -12,7 +12,6 @@ import trimesh
 from curvireg_torch.geometry import transform
 from curvireg_torch.rendering.contours import (
     MAX_OCCLUDING,
-    ContourPoints,
     MeshContours,
     _Places,
     _Views,
@@ -26,7 +25,7 @@ K = torch.tensor([[DISTANCE / PIXEL, 0, 63.5], [0, DISTANCE / PIXEL, 63.5], [0, 
 IN_FRONT = transform(torch.eye(3).double(), torch.tensor([0.0, 0.0, DISTANCE]).double())[None]
 
 
-def strip(x: list[float], z: list[float], y: float = 0.5) -> trimesh.Trimesh:
+def strip(x, z, y=0.5):
     """A surface that is bent along x only."""
     rows = [np.column_stack([x, np.full(len(x), end), z]) for end in (-y, y)]
     n = len(x)
@@ -34,13 +33,13 @@ def strip(x: list[float], z: list[float], y: float = 0.5) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate(rows), faces, process=False)
 
 
-def ridge(half_width: float, slope: float) -> trimesh.Trimesh:
+def ridge(half_width, slope):
     """A plate of 100 px with a ridge towards the camera, ``half_width`` px to both sides."""
     a = half_width * PIXEL
     return strip([-0.5, -a, 0.0, a, 0.5], [0.0, 0.0, -slope * a, 0.0, 0.0])
 
 
-def seen(mesh: trimesh.Trimesh, unit: float = 1.0) -> ContourPoints:
+def seen(mesh, unit=1.0):
     mesh = mesh.copy()
     mesh.apply_scale(unit)
     T = IN_FRONT.clone()
@@ -48,7 +47,7 @@ def seen(mesh: trimesh.Trimesh, unit: float = 1.0) -> ContourPoints:
     return MeshContours(mesh).points(T, K[None], SIZE)
 
 
-def has_crease(mesh: trimesh.Trimesh, unit: float = 1.0) -> bool:
+def has_crease(mesh, unit=1.0):
     """Whether points of a crease are along the middle of the plate."""
     points = seen(mesh, unit)
     model = points.model[0, MAX_OCCLUDING:][points.valid[0, MAX_OCCLUDING:]]
@@ -75,7 +74,7 @@ def test_the_surface_is_looked_up_two_pixels_beside_a_crease(half_width, slope, 
     assert has_crease(ridge(half_width, slope)) == expected
 
 
-def plates(gap: float) -> trimesh.Trimesh:
+def plates(gap):
     """A plate, and a smaller one of 40 px in front of it; the gap is a fraction of the radius."""
     large = strip([-0.5, 0.5], [0.0, 0.0])
     small = strip([-0.2, 0.2], [0.0, 0.0], y=0.2)

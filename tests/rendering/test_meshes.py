@@ -2,7 +2,6 @@
 camera."""
 
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -18,17 +17,17 @@ from curvireg_torch.rendering import make_renderer
 from .conftest import camera
 
 
-def render(mesh: object, backend: str) -> torch.Tensor:
+def render(mesh, backend):
     return cr.render_depth(mesh, *camera(4), renderer=backend)  # type: ignore[arg-type]
 
 
-def assert_same_depth(found: torch.Tensor, expected: torch.Tensor, *, atol: float = 1e-5) -> None:
+def assert_same_depth(found, expected, *, atol=1e-5):
     assert (expected > 0).sum() > 1000
     assert torch.equal(found > 0, expected > 0)
     torch.testing.assert_close(found, expected, rtol=0, atol=atol)
 
 
-def test_render_ignores_face_orientation_and_doubled_and_degenerate_faces(backend: str) -> None:
+def test_render_ignores_face_orientation_and_doubled_and_degenerate_faces(backend):
     mesh = trimesh.creation.icosphere(subdivisions=2)
     for flipped in (slice(None), slice(0, None, 2)):
         faces = mesh.faces.copy()
@@ -50,9 +49,7 @@ def test_render_ignores_face_orientation_and_doubled_and_degenerate_faces(backen
     assert_same_depth(render(damaged, backend), render(mesh, backend))
 
 
-def test_render_with_the_camera_inside_and_the_object_behind(
-    backend: str, orthographic: bool
-) -> None:
+def test_render_with_the_camera_inside_and_the_object_behind(backend, orthographic):
     renderer = make_renderer(trimesh.creation.box((2.0, 2.0, 2.0)), backend)
     wide = torch.tensor([[30.0, 0, 19.5], [0, 30.0, 14.5], [0, 0, 1]])
     near = 2e-3 * 3**0.5
@@ -64,7 +61,7 @@ def test_render_with_the_camera_inside_and_the_object_behind(
     assert depth[2, 0, 15, 20] == pytest.approx(near, abs=1e-4)
 
 
-def test_render_batches(backend: str) -> None:
+def test_render_batches(backend):
     """No views, an object outside the image, and a camera matrix per view."""
     renderer = make_renderer(trimesh.creation.box(), backend)
     T, one, size = camera(2)
@@ -81,9 +78,7 @@ def test_render_batches(backend: str) -> None:
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-4, [0.0, 0, 0]), (1e3, [2e6, -1e6, 5e5])])
-def test_render_is_precise_for_tiny_and_distant_objects(
-    backend: str, scale: float, shift: list[float]
-) -> None:
+def test_render_is_precise_for_tiny_and_distant_objects(backend, scale, shift):
     mesh = trimesh.creation.icosphere(subdivisions=2)
     T, one, size = camera(4)
     moved = mesh.copy().apply_scale(scale).apply_translation(shift)
@@ -93,7 +88,7 @@ def test_render_is_precise_for_tiny_and_distant_objects(
     torch.testing.assert_close(depth / scale, render(mesh, backend), rtol=0, atol=2e-5)
 
 
-def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails() -> None:
+def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails():
     T, one, size = camera(2)
     box = trimesh.creation.box()
     not_finite = T.clone()
@@ -117,12 +112,12 @@ def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails(
 
 
 def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     used: list[int] = []
     level = contours_module.MeshContours._level
 
-    def watched(contours: Any, limit: int) -> Any:
+    def watched(contours, limit):
         used.append(len(contours._edges[limit].faces))
         return level(contours, limit)
 

@@ -15,15 +15,15 @@ from curvireg_torch.synthetic import example_mesh
 from .conftest import BACKENDS, camera, interior, pixel_grid, require, smooth
 
 
-def inside_out(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def inside_out(mesh):
     return trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
 
 
-def half(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def half(mesh):
     return trimesh.Trimesh(mesh.vertices, mesh.faces[: len(mesh.faces) // 2], process=False)
 
 
-def crossed_prism() -> trimesh.Trimesh:
+def crossed_prism():
     """A closed surface over a polygon that crosses itself: half of it is inside out."""
     polygon = [[-1.0, -0.8], [1.0, 0.7], [1.0, -0.6], [-1.0, 0.9]]
     vertices = [[x, y, z] for z in (-0.5, 0.5) for x, y in polygon]
@@ -53,7 +53,7 @@ MESHES = {
 
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.parametrize("pair", list(itertools.combinations(BACKENDS, 2)), ids="-".join)
-def test_backends_agree(pair: tuple[str, str], name: str, orthographic: bool) -> None:
+def test_backends_agree(pair, name, orthographic):
     require(*pair, orthographic=orthographic)
     mesh = MESHES[name]()
     radius = mesh_radius(mesh)
@@ -71,14 +71,14 @@ def test_backends_agree(pair: tuple[str, str], name: str, orthographic: bool) ->
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_back_faces_of_closed_surfaces_are_not_drawn(name: str) -> None:
+def test_back_faces_of_closed_surfaces_are_not_drawn(name):
     assert make_renderer(MESHES[name]()).draws_back_faces, "both sides of a face are visible"
     assert make_renderer(MESHES[name](), many_views=True).draws_back_faces == (
         name not in ("parts", "fine", "knot")
     )
 
 
-def test_depth_of_a_sphere(backend: str, orthographic: bool) -> None:
+def test_depth_of_a_sphere(backend, orthographic):
     mesh = trimesh.creation.icosphere(subdivisions=6)  # flat by at most 1.5e-4 between vertices
     T, K, size = camera(2, orthographic=orthographic)
     depth = (
@@ -97,7 +97,7 @@ def test_depth_of_a_sphere(backend: str, orthographic: bool) -> None:
     assert not bool((depth > 0)[:, inside < 0].any())
 
 
-def test_silhouette_agrees_with_project_points(backend: str, orthographic: bool) -> None:
+def test_silhouette_agrees_with_project_points(backend, orthographic):
     """A triangle covers exactly the pixel centres inside its projection."""
     triangle = trimesh.Trimesh([[-0.7, -0.5, 0.1], [0.8, -0.3, -0.2], [0.1, 0.9, 0.3]], [[0, 1, 2]])
     T, K, size = camera(5, orthographic=orthographic)

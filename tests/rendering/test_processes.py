@@ -10,11 +10,12 @@ import torch
 import trimesh
 
 from curvireg_torch.rendering import make_renderer
+from tests._support.quick import slow_after
 
 from .conftest import camera, require
 
 
-def test_threads_share_a_renderer(backend: str) -> None:
+def test_threads_share_a_renderer(backend):
     renderer = make_renderer(trimesh.creation.icosphere(subdivisions=3), backend)
     T, K, size = camera(6)
     expected = renderer.render(T, K, size)
@@ -27,6 +28,7 @@ SCRIPT = """
 import os, sys, torch, trimesh
 from curvireg_torch.errors import RenderingError
 from curvireg_torch.rendering import make_renderer
+from tests._support.quick import slow_after
 
 T = torch.eye(4)[None]; T[0, 2, 3] = 4.0
 K = torch.tensor([[60.0, 0, 19.5], [0, 60.0, 14.5], [0, 0, 1]])
@@ -52,9 +54,10 @@ for backend in sys.argv[1:]:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 @pytest.mark.parametrize(
-    ("backends", "codes"), [(["auto", "embree"], ["0", "0"]), (["pyrender"], ["3"])]
+    ("backends", "codes"),
+    slow_after(1, [(["auto", "embree"], ["0", "0"]), (["pyrender"], ["3"])]),
 )
-def test_renderers_after_a_fork(backends: list[str], codes: list[str]) -> None:
+def test_renderers_after_a_fork(backends, codes):
     """embree and OpenCV work in the child; OpenGL cannot, and the error says what to do."""
     require(*backends)
     command = [sys.executable, "-c", SCRIPT, *backends]

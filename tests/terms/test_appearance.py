@@ -18,13 +18,13 @@ VIEWS = sample_views(azimuth_step=30, elevations=[0, 30])  # those of `small_ban
 PIPELINE = Pipeline(field="focus", box_jitter=0.0, bank=replace(Pipeline().bank, image_size=64))
 
 
-def large(**options) -> Pipeline:
+def large(**options):
     """A pipeline for which every bank is a large one."""
     return PIPELINE.with_term("appearance", exhaustive_limit=0, **options)
 
 
 @pytest.fixture(scope="module")
-def matcher(small_bank) -> ViewMatcher:
+def matcher(small_bank):
     return ViewMatcher(small_bank, pipeline=PIPELINE)
 
 
@@ -78,7 +78,7 @@ def test_large_bank_compares_the_cells_of_the_best_views(small_bank, truck, matc
 
 
 @pytest.fixture(scope="module")
-def painted_bank() -> ViewBank:
+def painted_bank():
     """A box with a red front and a blue back: rotated by 180 degrees, only its colours differ."""
     box = trimesh.creation.box((0.6, 0.6, 1.0)).subdivide().subdivide()
     colours = np.full((len(box.faces), 4), 255, np.uint8)

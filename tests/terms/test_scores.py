@@ -31,7 +31,7 @@ def test_correlation_is_the_cosine_of_the_better_crop_scored_by_standard_deviati
     torch.testing.assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
 
 
-def sample(count: int, length: int = 12) -> torch.Tensor:
+def sample(count, length=12):
     generator = torch.Generator().manual_seed(count)
     mixing = torch.randn(length, length, generator=generator)
     return torch.randn(count, length, generator=generator) @ mixing + 3.0
@@ -230,7 +230,7 @@ def test_box_jitter_recovers_a_shifted_view(bank):
 
 def test_a_field_that_changes_the_learned_one_is_used():
     class Doubled(LearnedCurvilinearSaliency):
-        def forward(self, image: torch.Tensor) -> torch.Tensor:
+        def forward(self, image):
             return 2.0 * super().forward(image)
 
     crops = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))

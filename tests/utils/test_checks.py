@@ -4,7 +4,6 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 import curvireg_torch as cr
 from curvireg_torch import errors, geometry
@@ -19,7 +18,7 @@ POSE = geometry.transform(
 )
 
 
-def changed(matrix: Tensor, *changes: tuple[int, int, float]) -> Tensor:
+def changed(matrix, *changes):
     matrix = matrix.clone()
     for i, j, value in changes:
         matrix[i, j] = value
@@ -39,7 +38,7 @@ BAD_CAMERAS = {
 
 
 @pytest.mark.parametrize("bad", BAD_CAMERAS)
-def test_check_camera_matrix_refuses_what_is_no_camera(bad: str) -> None:
+def test_check_camera_matrix_refuses_what_is_no_camera(bad):
     checks.check_camera_matrix(CAMERA)
     for call in (
         checks.check_camera_matrix,
@@ -61,7 +60,7 @@ BAD_ROTATIONS = {
 
 
 @pytest.mark.parametrize("bad", BAD_ROTATIONS)
-def test_check_rotation_and_check_pose_refuse_what_is_not_rigid(bad: str) -> None:
+def test_check_rotation_and_check_pose_refuse_what_is_not_rigid(bad):
     for call in (lambda R: checks.check_rotation(R, "R"), lambda R: cr.rotation_error(R, R)):
         with pytest.raises(InvalidInputError, match="expected rotations"):
             call(BAD_ROTATIONS[bad])
@@ -75,7 +74,7 @@ def test_check_rotation_and_check_pose_refuse_what_is_not_rigid(bad: str) -> Non
             call(T)
 
 
-def test_check_pose_refuses_other_rows_and_missing_values() -> None:
+def test_check_pose_refuses_other_rows_and_missing_values():
     for change in ((3, 0, 0.1), (3, 3, 2.0), (2, 3, math.inf), (1, 1, math.nan)):
         with pytest.raises(InvalidInputError, match=r"T: expected (rigid|finite)"):
             checks.check_pose(changed(POSE, change), "T")
@@ -83,7 +82,7 @@ def test_check_pose_refuses_other_rows_and_missing_values() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-def test_check_pose_accepts_rounded_poses(dtype: torch.dtype) -> None:
+def test_check_pose_accepts_rounded_poses(dtype):
     generator = torch.Generator().manual_seed(0)
     R = geometry.rotation_from_axis_angle(
         2.0 * torch.randn(500, 3, generator=generator, dtype=torch.float64)
@@ -98,7 +97,7 @@ def test_check_pose_accepts_rounded_poses(dtype: torch.dtype) -> None:
     checks.check_pose(T[0], "T")
 
 
-def test_check_photograph_and_check_pixels_refuse_other_images() -> None:
+def test_check_photograph_and_check_pixels_refuse_other_images():
     image = torch.rand(3, 8, 9)
     checks.check_photograph(image)
     for bad in (
@@ -124,7 +123,7 @@ def test_check_photograph_and_check_pixels_refuse_other_images() -> None:
             checks.check_pixels(torch.full((3, 2, 2), value), "of the box")
 
 
-def test_as_boxes_and_as_camera_matrices_accept_tensors_arrays_and_lists_only() -> None:
+def test_as_boxes_and_as_camera_matrices_accept_tensors_arrays_and_lists_only():
     boxes = torch.tensor([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
     for given in (boxes.double(), [*boxes], boxes.tolist(), [*boxes.numpy()], boxes.int().numpy()):
         assert torch.equal(checks.as_boxes(given, 2).float(), boxes)
@@ -158,7 +157,7 @@ def test_as_boxes_and_as_camera_matrices_accept_tensors_arrays_and_lists_only() 
             checks.as_camera_matrices(bad, 2)
 
 
-def test_numbers_and_integers_of_the_wrong_type_are_refused() -> None:
+def test_numbers_and_integers_of_the_wrong_type_are_refused():
     for wrong in ("1", None, True, math.nan, math.inf, 10**400, [1.0], torch.ones(2)):
         for check in (checks.check_number, checks.check_positive, checks.check_fraction):
             with pytest.raises(InvalidInputError, match="value: expected"):
@@ -172,7 +171,7 @@ def test_numbers_and_integers_of_the_wrong_type_are_refused() -> None:
 @pytest.mark.parametrize(
     "name", [n for n in vars(errors) if n.endswith(("Error", "Warning")) and n[0] != "_"]
 )
-def test_errors_keep_message_and_subject(name: str) -> None:
+def test_errors_keep_message_and_subject(name):
     error = getattr(errors, name)("unusable; use another", subject="a.png")
     for copy in (
         error,
@@ -185,7 +184,7 @@ def test_errors_keep_message_and_subject(name: str) -> None:
     assert str(type(error)("unusable")) == "unusable"
 
 
-def test_errors_carry_the_numbers_of_photographs() -> None:
+def test_errors_carry_the_numbers_of_photographs():
     names = ["a.png", "b.png", "c.png"]
     error = InvalidInputError("unusable", subject="mask.png", kind="camera").of_image(2)
     assert str(error) == "image 2: mask.png: unusable"
@@ -201,7 +200,7 @@ def test_errors_carry_the_numbers_of_photographs() -> None:
     assert both.causes[0].images == (1,)
 
 
-def test_check_square_pixels_accepts_ten_per_cent() -> None:
+def test_check_square_pixels_accepts_ten_per_cent():
     for ratio in (1.0 / 1.099, 1.0, 1.099):
         checks.check_square_pixels(changed(CAMERA, (0, 0, 220.1 * ratio)))
     for ratio in (1.0 / 1.101, 1.101):

@@ -15,10 +15,10 @@ HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"
 
 
 @pytest.fixture
-def only(monkeypatch: pytest.MonkeyPatch):
+def only(monkeypatch):
     """Let only some packages be installed."""
 
-    def install(*packages: str) -> None:
+    def install(*packages):
         monkeypatch.setattr(
             extras, "find_spec", lambda name: ModuleSpec(name, None) if name in packages else None
         )

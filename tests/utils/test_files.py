@@ -3,13 +3,11 @@ import os
 import signal
 import sys
 import unicodedata
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError, InvalidInputError, MissingFileError, OutputError
@@ -21,12 +19,12 @@ NEW = b"b" * 5_000_000
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     files.write_file(tmp_path / "file", OLD)
     return tmp_path / "file"
 
 
-def test_write_file_replaces_files_and_targets_of_links(tmp_path: Path) -> None:
+def test_write_file_replaces_files_and_targets_of_links(tmp_path):
     path = tmp_path / "new" / "folder" / "file"
     files.write_file(path, OLD)
     with path.open("rb") as reader:
@@ -40,7 +38,7 @@ def test_write_file_replaces_files_and_targets_of_links(tmp_path: Path) -> None:
     assert path.read_bytes() == OLD
 
 
-def test_write_file_keeps_the_old_content_if_writing_fails(path: Path) -> None:
+def test_write_file_keeps_the_old_content_if_writing_fails(path):
     resource = pytest.importorskip("resource", reason="limits of files are those of Unix")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
@@ -55,7 +53,7 @@ def test_write_file_keeps_the_old_content_if_writing_fails(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["file/x", "folder", "null"])
-def test_write_file_refuses_other_targets(tmp_path: Path, name: str) -> None:
+def test_write_file_refuses_other_targets(tmp_path, name):
     (tmp_path / "file").write_bytes(OLD)
     (tmp_path / "folder").mkdir()
     (tmp_path / "null").symlink_to(os.devnull)
@@ -67,7 +65,7 @@ def test_write_file_refuses_other_targets(tmp_path: Path, name: str) -> None:
     assert not Path(os.devnull).is_file()
 
 
-def test_check_writable_leaves_nothing_and_names_the_folder(tmp_path: Path) -> None:
+def test_check_writable_leaves_nothing_and_names_the_folder(tmp_path):
     files.check_writable(tmp_path / "a" / "b")
     assert not list((tmp_path / "a" / "b").iterdir())
     (tmp_path / "file").write_bytes(OLD)
@@ -80,9 +78,7 @@ def test_check_writable_leaves_nothing_and_names_the_folder(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
 )
-def test_write_file_keeps_the_old_content_if_interrupted(
-    number: signal.Signals, code: int, path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_write_file_keeps_the_old_content_if_interrupted(number, code, path, monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(number))
     monkeypatch.setattr("curvireg_torch.matching.list_cache", lambda: files.write_file(path, NEW))
     handlers = {
@@ -103,7 +99,7 @@ def test_write_file_keeps_the_old_content_if_interrupted(
     assert after == handlers
 
 
-def test_a_command_below_nohup_outlives_its_terminal() -> None:
+def test_a_command_below_nohup_outlives_its_terminal():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with files.terminable():
@@ -113,7 +109,7 @@ def test_a_command_below_nohup_outlives_its_terminal() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_write_csv_leaves_nothing_to_a_spreadsheet_to_compute(tmp_path: Path) -> None:
+def test_write_csv_leaves_nothing_to_a_spreadsheet_to_compute(tmp_path):
     cells = ["=1+1", "+cmd", "-2+3", "@sum", "\tx", "-1.5", "+2e-3", "a=b", "", -0.5]
     files.write_csv(tmp_path / "t.csv", [cells])
     with (tmp_path / "t.csv").open(newline="") as file:
@@ -121,7 +117,7 @@ def test_write_csv_leaves_nothing_to_a_spreadsheet_to_compute(tmp_path: Path) ->
     assert row == ["'=1+1", "'+cmd", "'-2+3", "'@sum", "'\tx", "-1.5", "+2e-3", "a=b", "", "-0.5"]
 
 
-def test_read_json_refuses_malicious_missing_and_large_files(tmp_path: Path) -> None:
+def test_read_json_refuses_malicious_missing_and_large_files(tmp_path):
     for content in (b"[" * 2_000_000, b'{"0": ' + b"1" * 100_000 + b"}", b"\xff", b"[1]"):
         (tmp_path / "a.json").write_bytes(content)
         with pytest.raises(
@@ -138,7 +134,7 @@ def test_read_json_refuses_malicious_missing_and_large_files(tmp_path: Path) -> 
         files.read_json(tmp_path / "none.json", dict, "README")
 
 
-def test_finite_numbers_accepts_finite_numbers_only() -> None:
+def test_finite_numbers_accepts_finite_numbers_only():
     assert files.finite_numbers([1, 2.5], 2) == (1.0, 2.5)
     for values in (
         [1],
@@ -155,8 +151,8 @@ def test_finite_numbers_accepts_finite_numbers_only() -> None:
 
 @pytest.mark.parametrize("digest", [files.tensor_digest, files.tensor_checksum])
 def test_tensor_digest_depends_on_name_dtype_shape_and_values(
-    digest: Callable[[Mapping[str, Tensor]], str],
-) -> None:
+    digest,
+):
     x = torch.arange(4.0)
     others = [
         {"b": x},
@@ -172,7 +168,7 @@ def test_tensor_digest_depends_on_name_dtype_shape_and_values(
     assert digest({"a": strided}) == digest({"a": x})
 
 
-def test_digests_have_as_many_digits_as_they_say() -> None:
+def test_digests_have_as_many_digits_as_they_say():
     tensors = {"a": torch.tensor(True)}
     assert len(files.tensor_digest(tensors, size=16)) == 32
     assert len(files.tensor_checksum(tensors)) == 8
@@ -216,7 +212,7 @@ def test_a_csv_file_that_grows_has_each_row_at_once_and_begins_anew(tmp_path):
 
 
 @pytest.mark.parametrize("stored", ["NFC", "NFD"])
-def test_a_name_is_found_however_its_accents_are_stored(tmp_path: Path, stored: Any) -> None:
+def test_a_name_is_found_however_its_accents_are_stored(tmp_path, stored):
     folder = tmp_path / unicodedata.normalize("NFD", "Möbel")
     folder.mkdir()
     file = folder / unicodedata.normalize(stored, "Stühle.png")
@@ -236,7 +232,7 @@ def test_a_name_is_found_however_its_accents_are_stored(tmp_path: Path, stored: 
         assert as_stored(missing) == missing
 
 
-def test_of_two_names_that_differ_in_form_alone_the_typed_one_is_taken(tmp_path: Path) -> None:
+def test_of_two_names_that_differ_in_form_alone_the_typed_one_is_taken(tmp_path):
     names = [unicodedata.normalize("NFC", "ü.png"), unicodedata.normalize("NFD", "ü.png")]
     for name in names:
         (tmp_path / name).write_text("")

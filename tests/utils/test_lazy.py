@@ -35,7 +35,7 @@ UNUSED = {
 }
 
 
-def imported_by(code: str) -> set[str]:
+def imported_by(code):
     """Top-level modules after ``code`` has run in a new process."""
     ending = "except SystemExit:\n    pass\nprint('\\n'.join(sys.modules), file=sys.stderr)"
     script = f"import sys\ntry:\n    {code}\n{ending}"

@@ -31,7 +31,7 @@ DOS_POSTSCRIPT = (
 )
 
 
-def _saved(name: str, mode: str = "RGB", **options: object) -> bytes:
+def _saved(name, mode="RGB", **options):
     file = io.BytesIO()
     Image.new(mode, (8, 8)).save(file, name, **options)
     return file.getvalue()
@@ -205,7 +205,7 @@ def test_pillow_is_given_the_one_decoder_that_the_first_bytes_name(monkeypatch):
     assert asked == [["PNG"], ["BMP"], ["JPEG"]]
 
 
-def _tiled(width: int, height: int, kind: int = 4) -> bytes:
+def _tiled(width, height, kind=4):
     """A TIFF of 10 x 10 px in one tile, which libtiff decodes as a whole."""
     values = {256: 10, 257: 10, 258: 8, 259: 5, 262: 1, 277: 1, 322: width, 323: height}
     data = 8 + 2 + 12 * (len(values) + 2) + 4

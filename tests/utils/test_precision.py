@@ -6,11 +6,11 @@ from curvireg_torch.utils.precision import full_precision, in_full_precision
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_autocast_is_off_within_and_as_before_afterwards(dtype: torch.dtype) -> None:
+def test_autocast_is_off_within_and_as_before_afterwards(dtype):
     a = torch.rand(3, 3)
 
     @in_full_precision
-    def product(x: torch.Tensor, *, y: torch.Tensor) -> torch.Tensor:
+    def product(x, *, y):
         """Of matrices."""
         return x @ y
 
@@ -26,7 +26,7 @@ def test_autocast_is_off_within_and_as_before_afterwards(dtype: torch.dtype) -> 
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_jobs_compute_without_autocast_on_one_thread_and_on_several(count: int) -> None:
+def test_jobs_compute_without_autocast_on_one_thread_and_on_several(count):
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -23,7 +23,7 @@ class Outer(Rows):
     absent: Tensor | None = None
 
 
-def rows(*values: float, name: str = "a") -> Outer:
+def rows(*values, name="a"):
     column = torch.tensor(values)
     return Outer(name, column[:, None].repeat(1, 2), Inner(10.0 * column))
 

@@ -6,7 +6,7 @@ import torch
 from curvireg_torch.utils.segments import best_within, order_within, place_within
 
 
-def table(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+def table(seed):
     """Scores with ties, and segments of which some have no rows."""
     generator = torch.Generator().manual_seed(seed)
     count = 1 + 7 * seed
@@ -14,7 +14,7 @@ def table(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     return scores, torch.randint(0, 6, (count,), generator=generator)
 
 
-def ordered(scores: torch.Tensor, segment: torch.Tensor) -> list[list[int]]:
+def ordered(scores, segment):
     """The rows of each segment that has some, best first."""
     rows: dict[int, list[int]] = {}
     for row, number in enumerate(segment.tolist()):

@@ -1,8 +1,5 @@
 """Digests of the package's own code."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import grimp
 import pytest
 
@@ -30,7 +27,7 @@ IMPORTED = (
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def package(tmp_path, monkeypatch):
     for name, text in FILES.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,18 +37,18 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     forget()
 
 
-def forget() -> None:
+def forget():
     package_digest.cache_clear()
     import_digest.cache_clear()
 
 
-def digests() -> tuple[str, str]:
+def digests():
     forget()
     return package_digest(without=("c", "d.py")), import_digest("a/one.py")
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_digests_depend_on_the_files_that_they_are_of(name: str, package: Path) -> None:
+def test_digests_depend_on_the_files_that_they_are_of(name, package):
     before = digests()
     with (package / name).open("a") as file:
         file.write("# changed")
@@ -60,7 +57,7 @@ def test_digests_depend_on_the_files_that_they_are_of(name: str, package: Path) 
     assert (before[0] != after[0], before[1] != after[1]) == (in_package, name in IMPORTED)
 
 
-def test_digests_depend_on_names(package: Path) -> None:
+def test_digests_depend_on_names(package):
     before = digests()
     (package / "b" / "three.py").rename(package / "b" / "other.py")
     after = digests()
@@ -68,7 +65,7 @@ def test_digests_depend_on_names(package: Path) -> None:
     assert before[1] != after[1]
 
 
-def test_what_does_not_exist_is_refused(package: Path) -> None:
+def test_what_does_not_exist_is_refused(package):
     with pytest.raises(FileNotFoundError, match="viewer"):
         package_digest(without=("viewer",))
     with pytest.raises(FileNotFoundError, match="six"):
@@ -78,7 +75,7 @@ def test_what_does_not_exist_is_refused(package: Path) -> None:
         imported_files("a/one.py")
 
 
-def test_a_bank_depends_on_all_that_its_file_imports_and_on_no_more() -> None:
+def test_a_bank_depends_on_all_that_its_file_imports_and_on_no_more():
     files = {
         path.relative_to(sources.PACKAGE).as_posix() for path in imported_files(cache._BUILDER)
     }

@@ -1,6 +1,5 @@
 import threading
 import time
-from collections.abc import Callable
 
 import pytest
 import torch
@@ -9,15 +8,15 @@ from curvireg_torch.utils import threads
 
 
 @pytest.fixture(autouse=True)
-def _two_threads(threads: Callable[[int], None]) -> None:
+def _two_threads(threads):
     threads(2)
 
 
-def test_for_each_runs_every_job_once_and_two_at_a_time() -> None:
+def test_for_each_runs_every_job_once_and_two_at_a_time():
     both = threading.Barrier(2, timeout=20)  # times out unless two jobs run at the same time
     done: list[int] = []
 
-    def job(number: int) -> None:
+    def job(number):
         both.wait()
         done.append(number)
 
@@ -27,10 +26,10 @@ def test_for_each_runs_every_job_once_and_two_at_a_time() -> None:
         assert sorted(done) == list(range(6))
 
 
-def test_for_each_stops_at_an_error_and_raises_it() -> None:
+def test_for_each_stops_at_an_error_and_raises_it():
     done = []
 
-    def job(number: int) -> None:
+    def job(number):
         if number == 2:
             raise ValueError("two")
         time.sleep(1e-4)
@@ -42,8 +41,8 @@ def test_for_each_stops_at_an_error_and_raises_it() -> None:
     threads.for_each(2, done.append)  # the threads survive
 
 
-def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
-    def job(number: int) -> tuple[int, int, int]:
+def test_map_on_threads_keeps_the_order_on_single_threads():
+    def job(number):
         return number, torch.get_num_threads(), threading.get_ident()
 
     out = threads.map_on_threads(job, range(5))
@@ -54,18 +53,18 @@ def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
     assert threads.map_on_threads(job, []) == []
 
 
-def test_threads_that_start_during_jobs_keep_the_number_of_the_process() -> None:
+def test_threads_that_start_during_jobs_keep_the_number_of_the_process():
     """A thread takes torch's number for the process over with its first call of torch, and keeps
     it."""
     found: list[int] = []
 
-    def on_a_new_thread() -> None:
+    def on_a_new_thread():
         thread = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
         with threads._starting:  # not while another job starts a pool
             thread.start()
             thread.join()
 
-    def job(level: int) -> int:
+    def job(level):
         on_a_new_thread()
         if level:  # pools within jobs
             with threads.single_threaded_pool() as pool:
@@ -79,7 +78,7 @@ def test_threads_that_start_during_jobs_keep_the_number_of_the_process() -> None
     assert torch.get_num_threads() == 2
 
 
-def test_the_caller_keeps_a_number_of_its_own() -> None:
+def test_the_caller_keeps_a_number_of_its_own():
     """Not the one that another thread set for the process since."""
     thread = threading.Thread(target=lambda: torch.set_num_threads(3))
     thread.start()
@@ -88,11 +87,11 @@ def test_the_caller_keeps_a_number_of_its_own() -> None:
     assert torch.get_num_threads() == 2
 
 
-def test_a_pool_whose_threads_cannot_start_fails_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pool_whose_threads_cannot_start_fails_at_once(monkeypatch):
     start = threading.Thread.start
     calls = []
 
-    def refuse_the_third(thread: threading.Thread) -> None:
+    def refuse_the_third(thread):
         calls.append(thread)
         if len(calls) == 3:  # the second of the pool, after the one that reads torch's number
             raise RuntimeError("can't start new thread")
@@ -106,10 +105,10 @@ def test_a_pool_whose_threads_cannot_start_fails_at_once(monkeypatch: pytest.Mon
     assert torch.get_num_threads() == 2
 
 
-def test_jobs_that_have_not_started_are_cancelled_after_an_error() -> None:
+def test_jobs_that_have_not_started_are_cancelled_after_an_error():
     done: list[int] = []
 
-    def job(number: int) -> None:
+    def job(number):
         if number == 0:
             raise ValueError("zero")
         time.sleep(0.01)
@@ -120,14 +119,14 @@ def test_jobs_that_have_not_started_are_cancelled_after_an_error() -> None:
     assert len(done) < 100
 
 
-def test_submitted_jobs_are_cancelled_after_an_error_of_the_caller() -> None:
+def test_submitted_jobs_are_cancelled_after_an_error_of_the_caller():
     done: list[int] = []
 
-    def job(number: int) -> None:
+    def job(number):
         time.sleep(0.01)
         done.append(number)
 
-    def submit_and_fail() -> None:
+    def submit_and_fail():
         with threads.single_threaded_pool() as pool:
             for number in range(200):
                 pool.submit(job, number)
@@ -139,14 +138,14 @@ def test_submitted_jobs_are_cancelled_after_an_error_of_the_caller() -> None:
 
 
 @pytest.mark.parametrize("gradients", [True, False])
-def test_jobs_record_gradients_as_their_caller_does(gradients: bool) -> None:
+def test_jobs_record_gradients_as_their_caller_does(gradients):
     with torch.set_grad_enabled(gradients):
         assert (
             threads.map_on_threads(lambda _: torch.is_grad_enabled(), range(3)) == [gradients] * 3
         )
 
 
-def test_jobs_share_few_threads_on_many_cores() -> None:
+def test_jobs_share_few_threads_on_many_cores():
     torch.set_num_threads(16)  # the fixture undoes it
     assert threads.available_threads() == threads.MAX_THREADS
     names = threads.map_on_threads(
@@ -155,10 +154,10 @@ def test_jobs_share_few_threads_on_many_cores() -> None:
     assert len(set(names)) <= threads.MAX_THREADS
 
 
-def test_one_torch_thread_gives_the_threads_of_torch_to_jobs() -> None:
+def test_one_torch_thread_gives_the_threads_of_torch_to_jobs():
     both = threading.Barrier(2, timeout=20)  # times out unless two jobs run at the same time
 
-    def threads_in_job(_: int) -> tuple[int, int]:
+    def threads_in_job(_):
         both.wait()
         return torch.get_num_threads(), threads.available_threads()
 

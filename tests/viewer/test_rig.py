@@ -55,6 +55,7 @@ def search(workspace):
     assert workspace.messages == {}
 
 
+@pytest.mark.slow
 def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_path):
     folder, rows = rig
     session = send(workspace, folder, "0.png", "rig.csv", "2.png", "1.png", "truck.safetensors")

@@ -91,6 +91,7 @@ def test_command_gives_the_same_result_bit_by_bit(session, registered):
     assert float(rotation_error(torch.tensor(document["rotation"]).double(), truth[:3, :3])) < 10
 
 
+@pytest.mark.slow
 def test_without_a_box_the_answer_is_a_detection(session, registered):
     session.shot.set_box(None)
     assert "--box" not in session.command()

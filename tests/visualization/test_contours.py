@@ -18,23 +18,21 @@ GREEN = (0, 255, 80)
 ORANGE = (255, 170, 0)
 
 
-def placed(z: float) -> torch.Tensor:
+def placed(z):
     T = torch.eye(4, dtype=torch.float64)
     T[2, 3] = z
     return T
 
 
-def drawn(
-    mesh: trimesh.Trimesh, T: torch.Tensor, size: tuple[int, int] = (SIZE, SIZE)
-) -> np.ndarray:
+def drawn(mesh, T, size=(SIZE, SIZE)):
     return contour_layer(ViewDescriber(mesh, BankSettings(image_size=64)), T, CAMERA, size)
 
 
-def colour(layer: np.ndarray, value: tuple[int, int, int]) -> np.ndarray:
+def colour(layer, value):
     return (layer[..., :3] == value).all(axis=2) & (layer[..., 3] == 255)
 
 
-def roof(degrees: float) -> trimesh.Trimesh:
+def roof(degrees):
     """Two planes that meet at the vertical ridge x = 0 in an angle of 180 - degrees, seen along
     z."""
     fall = float(np.tan(np.deg2rad(degrees / 2)))

@@ -16,12 +16,12 @@ from curvireg_torch.visualization.pose_glb import scene_glb
 from tests._support.scenes import CAMERA, SIZE, scene
 
 
-def tree_of(data: bytes) -> dict:
+def tree_of(data):
     (length,) = struct.unpack_from("<I", data, 12)
     return json.loads(data[20 : 20 + length])
 
 
-def project(points: np.ndarray, tree: dict) -> np.ndarray:
+def project(points, tree):
     """Pixels of points in metres in the file's camera, which is at the origin and looks along
     -z."""
     W = SIZE[1]

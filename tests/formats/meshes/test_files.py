@@ -1,5 +1,4 @@
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,12 +16,12 @@ EXPECTED["obj"] |= {"part.mtl", "picture.png"}
 EXPECTED["ply"] |= {"picture.png"}
 
 
-def picture(path: Path, shade: int = 0) -> None:
+def picture(path, shade=0):
     pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3) + shade
     Image.fromarray(pixels).save(path)
 
 
-def write(folder: Path, suffix: str) -> Path:
+def write(folder, suffix):
     """A mesh of one format with companion files."""
     folder.mkdir(parents=True, exist_ok=True)
     picture(folder / "picture.png")
@@ -64,9 +63,7 @@ def write(folder: Path, suffix: str) -> Path:
 
 
 @pytest.mark.parametrize("suffix", EXPECTED)
-def test_mesh_files_and_mesh_digest_cover_every_file_that_is_read(
-    tmp_path: Path, suffix: str
-) -> None:
+def test_mesh_files_and_mesh_digest_cover_every_file_that_is_read(tmp_path, suffix):
     path = write(tmp_path, suffix)
     load_mesh(path)
     assert {file.name for file in mesh_files(path)} == EXPECTED[suffix]
@@ -96,9 +93,7 @@ STARTS = {
 
 @pytest.mark.parametrize("suffix", ["obj", "stl", "glb", "ply", "3mf"])
 @pytest.mark.parametrize(("start", "words"), STARTS.items())
-def test_what_a_download_leaves_in_place_of_a_mesh_is_named(
-    tmp_path: Path, suffix: str, start: bytes, words: str
-) -> None:
+def test_what_a_download_leaves_in_place_of_a_mesh_is_named(tmp_path, suffix, start, words):
     path = tmp_path / f"a.{suffix}"
     path.write_bytes(start)
     with pytest.raises(MeshError, match=words):
@@ -106,16 +101,14 @@ def test_what_a_download_leaves_in_place_of_a_mesh_is_named(
 
 
 @pytest.mark.parametrize(("kind", "name"), [("ply", "a.obj"), ("glb", "b.stl")])
-def test_a_mesh_under_the_name_of_another_kind_is_named(
-    tmp_path: Path, kind: str, name: str
-) -> None:
+def test_a_mesh_under_the_name_of_another_kind_is_named(tmp_path, kind, name):
     path = tmp_path / name
     path.write_bytes(trimesh.creation.box().export(file_type=kind))
     with pytest.raises(MeshError, match=rf"of another kind than its name says; name it \.{kind}"):
         load_mesh(path)
 
 
-def test_mesh_digest_accepts_damaged_meshes_and_banks(tmp_path: Path) -> None:
+def test_mesh_digest_accepts_damaged_meshes_and_banks(tmp_path):
     path = write(tmp_path / "inside", "gltf")
     path.write_text("{")
     with pytest.raises(MeshError):

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable
 from io import BytesIO
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ TYPES = {"f": 5126, "B": 5121, "H": 5123, "I": 5125, "b": 5120, "h": 5122}
 class Tree:
     """A glTF file under construction: arrays become accessors of one buffer."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.data = b""
         self.content: dict[str, Any] = {
             "asset": {"version": "2.0"},
@@ -40,7 +39,7 @@ class Tree:
             "bufferViews": [],
         }
 
-    def array(self, values: Any, dtype: str = "f", **more: Any) -> int:
+    def array(self, values, dtype="f", **more):
         x = np.asarray(values, dtype)
         x = x[:, None] if x.ndim == 1 else x
         kind = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}[x.shape[1]]
@@ -56,29 +55,27 @@ class Tree:
         self.content["accessors"].append({**accessor, "count": len(x), "type": kind, **more})
         return len(self.content["accessors"]) - 1
 
-    def part(
-        self, indices: Any = None, positions: Any = BOX.vertices, **more: Any
-    ) -> dict[str, Any]:
+    def part(self, indices=None, positions=BOX.vertices, **more):
         part: dict[str, Any] = {"attributes": {"POSITION": self.array(positions)}, **more}
         if indices is not None:
             part["indices"] = self.array(np.ravel(indices), "I")
         self.content["meshes"][0]["primitives"].append(part)
         return part
 
-    def picture(self, pixels: np.ndarray) -> None:
+    def picture(self, pixels):
         file = BytesIO()
         Image.fromarray(pixels).save(file, "PNG")
         uri = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
         self.content |= {"images": [{"uri": uri}], "textures": [{"source": 0}]}
 
-    def write(self, path: Path) -> Path:
+    def write(self, path):
         uri = "data:;base64," + base64.b64encode(self.data).decode()
         self.content["buffers"] = [{"byteLength": len(self.data), "uri": uri}]
         path.write_text(json.dumps(self.content))
         return path
 
 
-def test_strips_and_fans_have_all_their_faces(tmp_path: Path, load: Load) -> None:
+def test_strips_and_fans_have_all_their_faces(tmp_path, load):
     square = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]
     angles = np.linspace(0, 2 * math.pi, 17)
     disc = [[0, 0, 0], *([math.cos(a), math.sin(a), 0] for a in angles)]
@@ -97,7 +94,7 @@ def test_strips_and_fans_have_all_their_faces(tmp_path: Path, load: Load) -> Non
     assert mesh.area == pytest.approx(22 + 16 * 0.5 * math.sin(math.pi / 8), rel=1e-6)
 
 
-def sparse(tree: Tree, index: Any, values: Any, kind: str = "B") -> dict[str, Any]:
+def sparse(tree, index, values, kind="B"):
     """What an accessor says of ``values`` at places that differ from its own."""
     accessors = tree.content["accessors"]
     places = [tree.array(index, kind), tree.array(values, "f")]
@@ -110,9 +107,7 @@ def sparse(tree: Tree, index: Any, values: Any, kind: str = "B") -> dict[str, An
 
 
 @pytest.mark.parametrize("kind", ["B", "H", "I"])
-def test_sparse_accessors_replace_some_of_their_values(
-    tmp_path: Path, load: Load, kind: str
-) -> None:
+def test_sparse_accessors_replace_some_of_their_values(tmp_path, load, kind):
     """As exporters write what differs from a copy, or from zeros where there is no view."""
     moved = [0, 7]
     tree = Tree()
@@ -143,9 +138,7 @@ def test_sparse_accessors_replace_some_of_their_values(
         ({}, "does not have"),
     ],
 )
-def test_damaged_sparse_accessors_are_refused(
-    tmp_path: Path, load: Load, changes: dict[str, Any], match: str
-) -> None:
+def test_damaged_sparse_accessors_are_refused(tmp_path, load, changes, match):
     tree = Tree()
     part = tree.part(BOX.faces)
     accessor = tree.content["accessors"][part["attributes"]["POSITION"]]
@@ -156,9 +149,7 @@ def test_damaged_sparse_accessors_are_refused(
 
 @pytest.mark.parametrize(("dtype", "largest"), [("B", 255), ("H", 65535), ("f", 1)])
 @pytest.mark.parametrize("factor", [None, [1.0, 1.0, 1.0, 1.0], [0.5, 1.0, 0.0, 1.0]])
-def test_vertex_colours_are_multiplied_by_the_material(
-    tmp_path: Path, load: Load, dtype: str, largest: int, factor: list[float] | None
-) -> None:
+def test_vertex_colours_are_multiplied_by_the_material(tmp_path, load, dtype, largest, factor):
     tree = Tree()
     shades = np.linspace(0, 1, 8)
     colours = np.stack([shades, 1 - shades, shades, np.ones(8)], axis=1)
@@ -193,12 +184,12 @@ def test_vertex_colours_are_multiplied_by_the_material(
 )
 @pytest.mark.parametrize("required", [True, False])
 def test_transforms_and_other_sets_of_texture_coordinates(
-    tmp_path: Path,
-    load: Load,
-    transform: dict[str, Any],
-    expected: list[tuple[float, float]],
-    required: bool,
-) -> None:
+    tmp_path,
+    load,
+    transform,
+    expected,
+    required,
+):
     """In the file (0, 0) is the top left; here it is the bottom left."""
     pixels = np.random.default_rng(0).integers(0, 255, (4, 4, 3), np.uint8)
     for number, info in (
@@ -231,7 +222,7 @@ def test_transforms_and_other_sets_of_texture_coordinates(
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_a_texture_without_coordinates_or_format_is_named(tmp_path: Path, load: Load) -> None:
+def test_a_texture_without_coordinates_or_format_is_named(tmp_path, load):
     tree = Tree()
     tree.picture(np.zeros((4, 4, 3), np.uint8))
     tree.part(BOX.faces, material=0)
@@ -243,7 +234,7 @@ def test_a_texture_without_coordinates_or_format_is_named(tmp_path: Path, load: 
     assert "in a format that is not read" in load(tree.write(tmp_path / "a.gltf"))[1][0]
 
 
-def test_quantised_positions_and_places_of_nodes(tmp_path: Path, load: Load) -> None:
+def test_quantised_positions_and_places_of_nodes(tmp_path, load):
     tree = Tree()
     part = tree.part(BOX.faces)
     part["attributes"]["POSITION"] = tree.array(
@@ -259,7 +250,7 @@ def test_quantised_positions_and_places_of_nodes(tmp_path: Path, load: Load) -> 
     np.testing.assert_allclose(mesh.bounds, [[9, -1.5, -0.5], [11, 1.5, 0.5]], atol=1e-5)
 
 
-def test_skinned_meshes_are_shown_as_their_joints_stand(tmp_path: Path, load: Load) -> None:
+def test_skinned_meshes_are_shown_as_their_joints_stand(tmp_path, load):
     tree = Tree()
     part = tree.part(BOX.faces)
     upper = BOX.vertices[:, 0] > 0
@@ -283,7 +274,7 @@ def test_skinned_meshes_are_shown_as_their_joints_stand(tmp_path: Path, load: Lo
     np.testing.assert_allclose(mesh.bounds, [[-1.5, 4, -0.5], [3.5, 6, 0.5]], atol=1e-6)
 
 
-def test_a_plain_material_is_no_print(tmp_path: Path, load: Load) -> None:
+def test_a_plain_material_is_no_print(tmp_path, load):
     can = trimesh.creation.cylinder(30.0, 100.0, sections=96)
     for factor in ([0.6, 0.6, 0.6, 1.0], [1.0, 1.0, 1.0, 1.0], [1.0, 0.0, 0.0, 1.0], None):
         tree = Tree()
@@ -296,7 +287,7 @@ def test_a_plain_material_is_no_print(tmp_path: Path, load: Load) -> None:
         assert len(mesh_symmetries(mesh)) == 72
 
 
-def test_morph_targets_are_named(tmp_path: Path, load: Load) -> None:
+def test_morph_targets_are_named(tmp_path, load):
     tree = Tree()
     tree.part(BOX.faces)
     tree.content["meshes"][0]["weights"] = [0.5]
@@ -314,7 +305,7 @@ def test_morph_targets_are_named(tmp_path: Path, load: Load) -> None:
         {"nodes": [{"mesh": 3}]},
     ],
 )
-def test_damaged_trees_are_refused(tmp_path: Path, change: dict[str, Any]) -> None:
+def test_damaged_trees_are_refused(tmp_path, change):
     tree = Tree()
     part = tree.part(BOX.faces, material=0)
     part["attributes"] |= {
@@ -331,7 +322,7 @@ def test_damaged_trees_are_refused(tmp_path: Path, change: dict[str, Any]) -> No
         cr.load_mesh(tree.write(tmp_path / "a.gltf"))
 
 
-def test_parts_share_a_view_without_copies(tmp_path: Path, load: Load) -> None:
+def test_parts_share_a_view_without_copies(tmp_path, load):
     """A thousand accessors of one view of 20 MB, and too many nodes."""
     tree = Tree()
     tree.part(None, np.zeros((9, 3)))

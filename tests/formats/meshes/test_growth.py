@@ -3,10 +3,8 @@
 import base64
 import json
 import tracemalloc
-from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -28,12 +26,12 @@ from tests.formats.meshes.test_hostile_meshes import tree
 UNUSED = 100_000  # vertices
 
 
-def resolved(monkeypatch: pytest.MonkeyPatch, path: Path) -> int:
+def resolved(monkeypatch, path):
     """How many paths are resolved while a mesh is read."""
     resolve = Path.resolve
     count = 0
 
-    def counted(self: Path, strict: bool = False) -> Path:
+    def counted(self, strict=False):
         nonlocal count
         count += 1
         return resolve(self, strict)
@@ -44,7 +42,7 @@ def resolved(monkeypatch: pytest.MonkeyPatch, path: Path) -> int:
     return count
 
 
-def peak(path: Path) -> int:
+def peak(path):
     """The most bytes that are held while a mesh is read."""
     tracemalloc.start()
     files.read_source(MeshSource(path))
@@ -53,15 +51,13 @@ def peak(path: Path) -> int:
     return most
 
 
-def robot(path: Path, *visuals: str) -> Path:
+def robot(path, *visuals):
     shapes = "".join(f"<visual><geometry>{one}</geometry></visual>" for one in visuals)
     path.write_text(f'<robot name="r"><link name="l">{shapes}</link></robot>')
     return path
 
 
-def test_names_of_urdf_are_looked_for_by_a_bounded_number_of_ends(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_names_of_urdf_are_looked_for_by_a_bounded_number_of_ends(tmp_path, monkeypatch):
     counts = []
     for parts in (10, 20, 1000, 2000):
         mesh = f'<mesh filename="package://{"a/" * parts}b.stl"/>'
@@ -77,13 +73,13 @@ def test_names_of_urdf_are_looked_for_by_a_bounded_number_of_ends(
         cr.load_mesh(path)
 
 
-def with_unused_vertices() -> ReadMesh:
+def with_unused_vertices():
     box = trimesh.creation.box()
     vertices = np.concatenate([np.zeros((UNUSED, 3)), box.vertices])
     return ReadMesh(vertices, np.asarray(box.faces, np.int64) + UNUSED)
 
 
-def test_unused_vertices_are_dropped() -> None:
+def test_unused_vertices_are_dropped():
     mesh = with_unused_vertices()
     small = mesh.without_unused_vertices()
     assert small.vertices.shape == (8, 3)
@@ -94,7 +90,7 @@ def test_unused_vertices_are_dropped() -> None:
 
 
 @pytest.mark.parametrize("suffix", ["urdf", "3mf"])
-def test_copies_of_a_part_do_not_hold_its_unused_vertices(tmp_path: Path, suffix: str) -> None:
+def test_copies_of_a_part_do_not_hold_its_unused_vertices(tmp_path, suffix):
     mesh = with_unused_vertices()
     ply = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     ply.export(tmp_path / "a.ply")
@@ -103,7 +99,7 @@ def test_copies_of_a_part_do_not_hold_its_unused_vertices(tmp_path: Path, suffix
     solid = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
     copy = '<component objectid="1" transform="1 0 0 0 1 0 0 0 1 0 0 {}"/>'
     peaks = []
-    for copies in (4, 8, 16):
+    for copies in (4, 16):
         if suffix == "urdf":
             path = robot(tmp_path / "a.urdf", *['<mesh filename="a.ply"/>'] * copies)
         else:
@@ -112,10 +108,10 @@ def test_copies_of_a_part_do_not_hold_its_unused_vertices(tmp_path: Path, suffix
             resources = f'<object id="1">{solid}</object>{whole}'
             path = write_threemf(tmp_path / "a.3mf", resources, '<item objectid="2"/>')
         peaks.append(peak(path))
-    assert peaks[2] - peaks[0] < UNUSED  # bytes: less than one for each vertex
+    assert peaks[1] - peaks[0] < UNUSED  # bytes: less than one for each vertex
 
 
-def part_of_image(count: int, image: dict[str, Any], **more: Any) -> dict[str, Any]:
+def part_of_image(count, image, **more):
     """``count`` parts with a material of their own, which share an image."""
     content = tree(
         nodes=[{"mesh": k} for k in range(count)],
@@ -137,15 +133,13 @@ def part_of_image(count: int, image: dict[str, Any], **more: Any) -> dict[str, A
     return content
 
 
-def picture() -> bytes:
+def picture():
     file = BytesIO()
     Image.new("RGB", (4, 4), (200, 100, 50)).save(file, "PNG")
     return file.getvalue()
 
 
-def test_bytes_of_a_shared_image_are_made_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bytes_of_a_shared_image_are_made_once(tmp_path, monkeypatch):
     coded = base64.b64encode(picture()).decode()
     points = tree()["buffers"][0]
     views = [*tree()["bufferViews"], {"buffer": 1, "byteLength": len(picture())}]
@@ -154,7 +148,7 @@ def test_bytes_of_a_shared_image_are_made_once(
     view = gltf._File._view
     viewed: list[int] = []
 
-    def noted(self: Any, index: int) -> memoryview:
+    def noted(self, index):
         viewed.append(index)
         return view(self, index)
 
@@ -173,7 +167,7 @@ def test_bytes_of_a_shared_image_are_made_once(
         assert viewed.count(1) == 1
 
 
-def test_joints_of_a_skin_are_placed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_joints_of_a_skin_are_placed_once(tmp_path, monkeypatch):
     joints = Mock(wraps=gltf._File._joints)
     placed = Mock(wraps=np.stack)
     attributes = {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2}
@@ -217,9 +211,7 @@ def test_joints_of_a_skin_are_placed_once(tmp_path: Path, monkeypatch: pytest.Mo
         cr.load_mesh(path)
 
 
-def test_names_outside_of_the_folder_are_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_names_outside_of_the_folder_are_counted(tmp_path, monkeypatch):
     path = tmp_path / "a.obj"
     triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     counts = []
@@ -251,13 +243,11 @@ def test_names_outside_of_the_folder_are_counted(
         ("\ud800.png", False),
     ],
 )
-def test_names_that_no_file_has(name: str, is_possible: bool) -> None:
+def test_names_that_no_file_has(name, is_possible):
     assert is_file_name(name) == is_possible
 
 
-def test_a_long_name_of_a_texture_leaves_the_mesh_alone(
-    tmp_path: Path, load: Callable[..., tuple[trimesh.Trimesh, list[str]]]
-) -> None:
+def test_a_long_name_of_a_texture_leaves_the_mesh_alone(tmp_path, load):
     (tmp_path / "a.mtl").write_text(f"newmtl m\nKd 1 0 0\nmap_Kd {'x' * 8000}.png\n")
     (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
     mesh, texts = load(tmp_path / "a.obj")
@@ -267,9 +257,7 @@ def test_a_long_name_of_a_texture_leaves_the_mesh_alone(
     ]
 
 
-def test_a_texture_of_many_groups_is_unpacked_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_texture_of_many_groups_is_unpacked_once(tmp_path, monkeypatch):
     groups = "".join(
         f'<texture2dgroup id="{k}" texid="7"><tex2coord u="0" v="0"/></texture2dgroup>'
         for k in range(10, 20)
@@ -284,7 +272,7 @@ def test_a_texture_of_many_groups_is_unpacked_once(
     content = threemf._Package._content
     asked: list[str] = []
 
-    def noted(self: Any, name: str) -> bytes:
+    def noted(self, name):
         asked.append(name)
         return content(self, name)
 
@@ -299,9 +287,7 @@ def test_a_texture_of_many_groups_is_unpacked_once(
 
 
 @pytest.mark.skipif(not is_installed("collada"), reason="collada is not installed")
-def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(tmp_path, monkeypatch):
     (tmp_path / "label.png").write_bytes(picture())
     path = tmp_path / "a.dae"
     text = collada()
@@ -329,7 +315,7 @@ def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(
         cr.load_mesh(path)
 
 
-def test_a_program_has_limits_of_time_and_memory(tmp_path: Path) -> None:
+def test_a_program_has_limits_of_time_and_memory(tmp_path):
     program = tmp_path / "program.py"
     limits = {"name": "It", "seconds": 60.0, "memory": 1 << 28, "advice": "export less"}
     program.write_text("import sys\nsys.exit(int(sys.argv[1]))")
@@ -344,7 +330,7 @@ def test_a_program_has_limits_of_time_and_memory(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not is_installed("cascadio"), reason="cascadio is not installed")
-def test_opencascade_has_a_limit_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opencascade_has_a_limit_of_memory(tmp_path, monkeypatch):
     (tmp_path / "a.step").write_text(step_file((3.0, 2.0, 1.0), "mm"))
     monkeypatch.setattr(cad, "MAX_CAD_MEMORY", 1 << 28)
     with pytest.raises(MeshError, match=r"OpenCASCADE (needs more than|finds no shape)"):
@@ -352,9 +338,7 @@ def test_opencascade_has_a_limit_of_memory(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
-def test_usd_drops_unused_points_before_they_are_copied(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_usd_drops_unused_points_before_they_are_copied(tmp_path, monkeypatch):
     points = ", ".join(["(9, 9, 9)"] * 1000 + ["(0, 0, 0)", "(1, 0, 0)", "(0, 1, 0)"])
     text = f"""#usda 1.0
 def Xform "a" (

@@ -7,8 +7,6 @@ import struct
 import time
 import tracemalloc
 from io import BytesIO
-from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -24,7 +22,7 @@ from curvireg_torch.mesh import mesh as mesh_module
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
 
 
-def tree(**changes: Any) -> dict[str, Any]:
+def tree(**changes):
     """A triangle as glTF."""
     whole = {
         "asset": {"version": "2.0"},
@@ -39,7 +37,7 @@ def tree(**changes: Any) -> dict[str, Any]:
     return {**whole, **changes}
 
 
-def glb(content: dict[str, Any]) -> bytes:
+def glb(content):
     text = json.dumps({**content, "buffers": [{"byteLength": 36}]}).encode()
     text += b" " * (-len(text) % 4)
     chunks = (
@@ -48,9 +46,7 @@ def glb(content: dict[str, Any]) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-def refused(
-    path: Path, content: bytes, match: str, *, seconds: float = 5.0, megabytes: float = 100.0
-) -> None:
+def refused(path, content, match, *, seconds=5.0, megabytes=100.0):
     path.write_bytes(content)
     tracemalloc.start()
     start = time.process_time()
@@ -64,7 +60,7 @@ def refused(
     assert path.name in str(caught.value)
 
 
-def test_load_mesh_reads_the_valid_gltf_and_glb_and_refuses_damaged_glb(tmp_path: Path) -> None:
+def test_load_mesh_reads_the_valid_gltf_and_glb_and_refuses_damaged_glb(tmp_path):
     (tmp_path / "a.gltf").write_text(json.dumps(tree()))
     (tmp_path / "a.glb").write_bytes(glb(tree()))
     assert cr.load_mesh(tmp_path / "a.gltf").area == cr.load_mesh(tmp_path / "a.glb").area == 0.5
@@ -77,7 +73,7 @@ def test_load_mesh_reads_the_valid_gltf_and_glb_and_refuses_damaged_glb(tmp_path
         refused(tmp_path / "a.glb", damaged, "cannot be read")
 
 
-def zeros(**changes: Any) -> dict[str, Any]:
+def zeros(**changes):
     """A triangle whose accessor is changed."""
     return {
         "accessors": [
@@ -86,14 +82,14 @@ def zeros(**changes: Any) -> dict[str, Any]:
     }
 
 
-def required(name: str) -> dict[str, Any]:
+def required(name):
     return {"extensionsRequired": [name]}
 
 
 INSTANCES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
 
 
-def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path: Path) -> None:
+def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path):
     for changes, match in (
         ({"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "circle"),
         ({"nodes": [{"children": [0], "mesh": 0}]}, "circle"),
@@ -125,7 +121,7 @@ def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path: Path) -> Non
             refused(tmp_path / "a.glb", glb(tree(**changes)), match)
 
 
-def test_load_mesh_decodes_a_texture_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_load_mesh_decodes_a_texture_once(tmp_path, monkeypatch):
     """Few bytes unpack to a large picture, which many parts share."""
     picture = BytesIO()
     Image.new("RGB", (4096, 4096), (200, 100, 50)).save(picture, "PNG")
@@ -163,7 +159,7 @@ OUTSIDE = [
 
 
 @pytest.mark.parametrize("uri", [*OUTSIDE, "link.bin", "Linked/b.bin", "linked/b.bin", "no.bin"])
-def test_load_mesh_opens_no_file_outside_the_folder(tmp_path: Path, uri: str) -> None:
+def test_load_mesh_opens_no_file_outside_the_folder(tmp_path, uri):
     folder = tmp_path / "inside"
     folder.mkdir()
     (tmp_path / "b.bin").write_bytes(POINTS)
@@ -181,9 +177,7 @@ PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000
 PLY += b"property list uchar int vertex_indices\nend_header\n"
 
 
-def test_load_mesh_refuses_false_claims_and_bounds_its_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path, monkeypatch):
     for name, content, match in (
         ("a.off", b"OFF\n1000000000 1000000000 0\n0 0 0\n", "too early"),
         ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
@@ -211,7 +205,7 @@ def test_load_mesh_refuses_false_claims_and_bounds_its_work(
     refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
 
 
-def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path: Path) -> None:
+def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path):
     """trimesh alone multiplies the whole chain again for each part."""
     half_degree = {
         "rotation": [0.0, 0.0, math.sin(math.radians(0.25)), math.cos(math.radians(0.25))]
@@ -232,9 +226,7 @@ def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path: Path) ->
         assert np.abs(vertices - [point.real, point.imag, 0.7]).max(axis=1).min() < 1e-6
 
 
-def test_divide_faces_counts_before_it_divides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_divide_faces_counts_before_it_divides(tmp_path, monkeypatch):
     dart = b"OFF\n4 %d 0\n0 0 0\n1 2 0\n0 1 0\n-1 2 0\n" + b"4 0 1 2 3\n" * 10
     ply = PLY.replace(b"9000000", b"10") % (b"ascii", 4) + dart.split(b"\n", 2)[2]
     obj = b"v 0 0 0\nv 1 2 0\nv 0 1 0\nv -1 2 0\n" + b"f 1 2 3 4\n" * 10

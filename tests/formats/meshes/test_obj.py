@@ -3,7 +3,6 @@
 import argparse
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,20 +25,20 @@ BOX = POINTS + "".join(HALVES)
 Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 
 
-def textured(faces: str) -> str:
+def textured(faces):
     """The faces with texture coordinates at their corners, one after the other."""
     rows = [line.split()[1:] for line in faces.splitlines()]
     return "".join(f"f {a}/1 {b}/2 {c}/3\n" for a, b, c in rows)
 
 
-def picture(path: Path, seed: int = 0) -> np.ndarray:
+def picture(path, seed=0):
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = np.random.default_rng(seed).integers(0, 255, (8, 8, 3), np.uint8)
     Image.fromarray(pixels).save(path)
     return pixels
 
 
-def write(folder: Path, library: str, name: str = "a.mtl") -> Path:
+def write(folder, library, name="a.mtl"):
     """A box that is textured by material ``label``."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / name).write_text(library)
@@ -52,9 +51,7 @@ def write(folder: Path, library: str, name: str = "a.mtl") -> Path:
     "encoding", ["utf-8-sig", "utf-16", "utf-16-le-mark", "latin-1", "gbk", "cr", "crlf"]
 )
 @pytest.mark.parametrize("first", ["v", "mtllib", "comment", "o"])
-def test_every_encoding_gives_the_same_mesh(
-    tmp_path: Path, load: Load, encoding: str, first: str
-) -> None:
+def test_every_encoding_gives_the_same_mesh(tmp_path, load, encoding, first):
     name = {"latin-1": "Gehäuse", "gbk": "外壳"}.get(encoding, "part")
     text = {"v": "", "mtllib": "mtllib m.mtl\n", "comment": f"# {name}\n", "o": f"o {name}\n"}[
         first
@@ -71,9 +68,7 @@ def test_every_encoding_gives_the_same_mesh(
     assert (len(mesh.faces), mesh.extents.tolist(), texts) == (12, [3.0, 2.0, 1.0], [])
 
 
-def test_vertices_and_faces_in_turn_with_negative_indices_and_materials_that_return(
-    tmp_path: Path, load: Load
-) -> None:
+def test_vertices_and_faces_in_turn_with_negative_indices_and_materials_that_return(tmp_path, load):
     counted_back = "".join(
         "f " + " ".join(str(int(i) - 9) for i in line.split()[1:]) + "\n"
         for line in "".join(HALVES).splitlines()
@@ -96,7 +91,7 @@ def test_vertices_and_faces_in_turn_with_negative_indices_and_materials_that_ret
     )
 
 
-def test_materials_of_all_libraries_and_none_without_a_name(tmp_path: Path, load: Load) -> None:
+def test_materials_of_all_libraries_and_none_without_a_name(tmp_path, load):
     (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
     (tmp_path / "b c.mtl").write_text("newmtl blue\nKd 0 0 1\n")
     (tmp_path / "b.mtl").write_text("newmtl blue\nKd 0 0 1\n")
@@ -140,13 +135,13 @@ def test_materials_of_all_libraries_and_none_without_a_name(tmp_path: Path, load
     ["label.png", "my label.png", "LABEL.PNG", '"label.png"', "maps\\label.png", "./label.png"],
 )
 def test_options_of_a_texture_precede_its_name(
-    tmp_path: Path,
-    load: Load,
-    options: str,
-    scale: tuple[float, float],
-    offset: tuple[float, float],
-    name: str,
-) -> None:
+    tmp_path,
+    load,
+    options,
+    scale,
+    offset,
+    name,
+):
     folder = tmp_path / "maps" if "maps" in name else tmp_path
     file = name.replace("maps\\", "").strip('"')
     pixels = picture(folder / (file.lower() if name.isupper() else file))
@@ -161,9 +156,7 @@ def test_options_of_a_texture_precede_its_name(
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "gbk"])
-def test_a_library_in_another_encoding_finds_its_texture(
-    tmp_path: Path, load: Load, encoding: str
-) -> None:
+def test_a_library_in_another_encoding_finds_its_texture(tmp_path, load, encoding):
     name = "标签.png" if encoding == "gbk" else "Gehäuse.png"
     picture(tmp_path / name)
     path = write(tmp_path, "")
@@ -174,8 +167,8 @@ def test_a_library_in_another_encoding_finds_its_texture(
 
 
 def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_is_given(
-    tmp_path: Path, load: Load
-) -> None:
+    tmp_path, load
+):
     picture(tmp_path / "images" / "label.png")
     for name in (
         "../images/label.png",
@@ -200,7 +193,7 @@ def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_i
     assert has_colours(load(path, textures=tmp_path)[0])
 
 
-def test_colours_behind_the_coordinates(tmp_path: Path, load: Load) -> None:
+def test_colours_behind_the_coordinates(tmp_path, load):
     for scale in (1, 255):
         points = "".join(
             f"{line} {k % 2 * scale} 0 {scale}\n" for k, line in enumerate(POINTS.splitlines())
@@ -214,7 +207,7 @@ def test_colours_behind_the_coordinates(tmp_path: Path, load: Load) -> None:
         }
 
 
-def test_corners_of_several_forms_in_one_file(tmp_path: Path, load: Load) -> None:
+def test_corners_of_several_forms_in_one_file(tmp_path, load):
     faces = (
         "".join(HALVES)
         .replace("f 1 3 4\n", "f 1/1 3/2/1 4\n")
@@ -224,7 +217,7 @@ def test_corners_of_several_forms_in_one_file(tmp_path: Path, load: Load) -> Non
     np.testing.assert_array_equal(load(tmp_path / "a.obj")[0].faces, load_box(tmp_path).faces)
 
 
-def load_box(folder: Path) -> trimesh.Trimesh:
+def load_box(folder):
     (folder / "plain.obj").write_text(BOX)
     return cr.load_mesh(folder / "plain.obj")
 
@@ -233,7 +226,7 @@ def load_box(folder: Path) -> trimesh.Trimesh:
     "line",
     ["v 1 2", "v 0,5 1,0 2,0", "v a b c", "f 1 2 99", "f 1 2 -99", "f 1 2 0", "f 1/9 2/9 3/9"],
 )
-def test_damaged_lines_are_refused(tmp_path: Path, line: str) -> None:
+def test_damaged_lines_are_refused(tmp_path, line):
     (tmp_path / "a.obj").write_text(f"{BOX}vt 0 0\n{line}\n")
     with pytest.raises(MeshError, match=r"a\.obj: cannot be read"):
         cr.load_mesh(tmp_path / "a.obj")
@@ -254,16 +247,16 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_time_grows_with_the_size(tmp_path: Path, kind: str) -> None:
+def test_time_grows_with_the_size(tmp_path, kind):
     """Of four times the size, at most nine times the time; quadratic readers take sixteen times as
     long."""
 
-    def written(n: int) -> Path:
+    def written(n):
         path = tmp_path / "a.obj"
         path.write_text(HOSTILE[kind](n))
         return path
 
-    def read(path: Path) -> None:
+    def read(path):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             cr.load_mesh(path)
@@ -271,7 +264,7 @@ def test_time_grows_with_the_size(tmp_path: Path, kind: str) -> None:
     check_linear(read, written, 5_000)
 
 
-def test_an_obj_of_many_parts_is_refused(tmp_path: Path) -> None:
+def test_an_obj_of_many_parts_is_refused(tmp_path):
     for key in ("o", "g", "usemtl", "mtllib"):
         path = tmp_path / "a.obj"
         path.write_text(POINTS + "".join(f"{key} p{k}\nf 1 2 3\n" for k in range(10_001)))
@@ -279,7 +272,7 @@ def test_an_obj_of_many_parts_is_refused(tmp_path: Path) -> None:
             cr.load_mesh(path)
 
 
-def test_a_can_with_one_plain_material_is_grey(tmp_path: Path, load: Load) -> None:
+def test_a_can_with_one_plain_material_is_grey(tmp_path, load):
     """Texture coordinates without a material, a missing library, and one colour: no print, and all
     its symmetries."""
     can = trimesh.creation.cylinder(30.0, 100.0, sections=96)
@@ -303,7 +296,7 @@ def test_a_can_with_one_plain_material_is_grey(tmp_path: Path, load: Load) -> No
         )
 
 
-def test_options_of_the_command_line_reach_the_reader(tmp_path: Path) -> None:
+def test_options_of_the_command_line_reach_the_reader(tmp_path):
     picture(tmp_path / "images" / "label.png")
     path = write(tmp_path / "models", "newmtl label\nmap_Kd ../images/label.png\n")
     parser = argparse.ArgumentParser()

@@ -7,8 +7,6 @@ import warnings
 import zipfile
 from collections.abc import Callable
 from io import BytesIO
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +36,7 @@ WHITE = [255, 255, 255]
 QUARTER = [0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 
 
-def first_corners(mesh: trimesh.Trimesh) -> list[list[int]]:
+def first_corners(mesh):
     """The colours of the first corner of each face."""
     colours = surface_colours(mesh)
     assert colours is not None
@@ -46,7 +44,7 @@ def first_corners(mesh: trimesh.Trimesh) -> list[list[int]]:
     return found
 
 
-def textures(mesh: trimesh.Trimesh) -> list[list[int]]:
+def textures(mesh):
     """The colour of each face's texture in its first texel; white where there is none."""
     colours = surface_colours(mesh)
     assert colours is not None
@@ -57,7 +55,7 @@ def textures(mesh: trimesh.Trimesh) -> list[list[int]]:
 # glTF
 
 
-def test_a_node_is_scaled_then_turned_then_moved(tmp_path: Path) -> None:
+def test_a_node_is_scaled_then_turned_then_moved(tmp_path):
     tree = Tree()
     tree.part(None, TRIANGLE)
     node = {"mesh": 0, "rotation": QUARTER, "scale": [2, 3, 5], "translation": [10, 0, 0]}
@@ -67,7 +65,7 @@ def test_a_node_is_scaled_then_turned_then_moved(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.vertices, [[10, 0, 0], [10, 2, 0], [7, 0, 0]], atol=1e-6)
 
 
-def test_a_node_lies_in_the_frame_of_its_parent(tmp_path: Path) -> None:
+def test_a_node_lies_in_the_frame_of_its_parent(tmp_path):
     tree = Tree()
     tree.part(None, TRIANGLE)
     parent = {"children": [1], "rotation": QUARTER, "translation": [0, 0, 1]}
@@ -76,7 +74,7 @@ def test_a_node_lies_in_the_frame_of_its_parent(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.vertices, [[0, 5, 1], [0, 6, 1], [-1, 5, 1]], atol=1e-6)
 
 
-def test_a_joint_moves_what_its_inverse_bind_matrix_has_moved(tmp_path: Path) -> None:
+def test_a_joint_moves_what_its_inverse_bind_matrix_has_moved(tmp_path):
     tree = Tree()
     part = tree.part(None, TRIANGLE)
     part["attributes"]["JOINTS_0"] = tree.array([[0, 0, 0, 0]] * 3, "B")
@@ -92,7 +90,7 @@ def test_a_joint_moves_what_its_inverse_bind_matrix_has_moved(tmp_path: Path) ->
     np.testing.assert_allclose(mesh.vertices, [[0, 4, 0], [0, 5, 0], [-1, 4, 0]], atol=1e-6)
 
 
-def test_weights_of_joints_are_shares(tmp_path: Path) -> None:
+def test_weights_of_joints_are_shares(tmp_path):
     tree = Tree()
     part = tree.part(None, TRIANGLE)
     part["attributes"]["JOINTS_0"] = tree.array([[0, 1, 0, 0]] * 3, "B")
@@ -104,7 +102,7 @@ def test_weights_of_joints_are_shares(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.vertices, np.add(TRIANGLE, [0, 0, 1]), atol=1e-6)
 
 
-def test_the_least_integer_of_a_fraction_is_minus_one(tmp_path: Path) -> None:
+def test_the_least_integer_of_a_fraction_is_minus_one(tmp_path):
     tree = Tree()
     positions = tree.array([[-128, 0, 0], [127, 0, 0], [0, -127, 0]], "b", normalized=True)
     tree.content["meshes"] = [{"primitives": [{"attributes": {"POSITION": positions}}]}]
@@ -112,7 +110,7 @@ def test_the_least_integer_of_a_fraction_is_minus_one(tmp_path: Path) -> None:
     assert mesh.bounds.tolist() == [[-1, -1, 0], [1, 0, 0]]
 
 
-def textured(more: dict[str, Any], material: dict[str, Any] | None = None) -> Tree:
+def textured(more, material=None):
     """A triangle with two sets of coordinates, and a texture; ``more`` is said of its use."""
     tree = Tree()
     part = tree.part(None, TRIANGLE, material=0)
@@ -124,13 +122,13 @@ def textured(more: dict[str, Any], material: dict[str, Any] | None = None) -> Tr
     return tree
 
 
-def coordinates(mesh: trimesh.Trimesh) -> np.ndarray:
+def coordinates(mesh):
     colours = surface_colours(mesh)
     assert colours is not None
     return colours.uv[0] * [1, -1] + [0, 1]  # from the top left, as in glTF
 
 
-def test_coordinates_are_scaled_then_turned_then_moved(tmp_path: Path) -> None:
+def test_coordinates_are_scaled_then_turned_then_moved(tmp_path):
     transform = {"scale": [2, 4], "rotation": math.pi / 2, "offset": [0.5, 0.25]}
     tree = textured({"extensions": {"KHR_texture_transform": transform}})
     found = coordinates(cr.load_mesh(tree.write(tmp_path / "a.gltf")))
@@ -138,7 +136,7 @@ def test_coordinates_are_scaled_then_turned_then_moved(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, [[0.5, 0.25], [0.5, -1.75], [2.5, 0.25]], atol=1e-6)
 
 
-def test_the_set_that_a_transform_names_wins(tmp_path: Path) -> None:
+def test_the_set_that_a_transform_names_wins(tmp_path):
     for more, first in (
         ({}, 0.0),
         ({"texCoord": 1}, 0.25),
@@ -150,7 +148,7 @@ def test_the_set_that_a_transform_names_wins(tmp_path: Path) -> None:
         assert first_corners(mesh) == [RED], "a texture times the factor of the material"
 
 
-def test_specular_colours_win_over_metallic_ones(tmp_path: Path) -> None:
+def test_specular_colours_win_over_metallic_ones(tmp_path):
     specular = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0, 0, 1, 1]}}
     metallic = {"baseColorFactor": [1, 0, 0, 1], "baseColorTexture": {"index": 0}}
     material = {"pbrMetallicRoughness": metallic, "extensions": specular}
@@ -159,7 +157,7 @@ def test_specular_colours_win_over_metallic_ones(tmp_path: Path) -> None:
     assert surface_colours(mesh).textures == ()  # type: ignore[union-attr]
 
 
-def test_a_picture_as_webp_wins(tmp_path: Path) -> None:
+def test_a_picture_as_webp_wins(tmp_path):
     tree = textured({})
     tree.content["images"] += [{"uri": "b.png"}]
     (tmp_path / "b.png").write_bytes(painted((0, 255, 0)))
@@ -170,7 +168,7 @@ def test_a_picture_as_webp_wins(tmp_path: Path) -> None:
 # OBJ
 
 
-def obj(folder: Path, libraries: dict[str, str], more: str = "") -> Path:
+def obj(folder, libraries, more=""):
     for name, text in libraries.items():
         (folder / name).write_text(text)
     path = folder / "a.obj"
@@ -179,14 +177,14 @@ def obj(folder: Path, libraries: dict[str, str], more: str = "") -> Path:
     return path
 
 
-def test_of_two_materials_of_a_name_the_first_counts(tmp_path: Path) -> None:
+def test_of_two_materials_of_a_name_the_first_counts(tmp_path):
     red = "newmtl m\nKd 1 0 0\n"
     blue = "newmtl m\nKd 0 0 1\n"
     assert first_corners(cr.load_mesh(obj(tmp_path, {"a.mtl": red, "b.mtl": blue}))) == [RED]
     assert first_corners(cr.load_mesh(obj(tmp_path, {"b.mtl": blue, "a.mtl": red}))) == [BLUE]
 
 
-def test_colours_of_vertices_win_over_those_of_materials(tmp_path: Path) -> None:
+def test_colours_of_vertices_win_over_those_of_materials(tmp_path):
     path = obj(tmp_path, {"a.mtl": "newmtl m\nKd 1 0 0\n"})
     text = path.read_text()
     for line in ("v 0 0 0", "v 1 0 0", "v 0 1 0"):
@@ -195,7 +193,7 @@ def test_colours_of_vertices_win_over_those_of_materials(tmp_path: Path) -> None
     assert first_corners(cr.load_mesh(path)) == [GREEN]
 
 
-def test_indices_below_zero_count_from_the_face(tmp_path: Path) -> None:
+def test_indices_below_zero_count_from_the_face(tmp_path):
     path = tmp_path / "a.obj"
     path.write_text("v 9 9 9\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 5 5 5\nf 2 3 -1\n")
     mesh = cr.load_mesh(path)
@@ -205,7 +203,7 @@ def test_indices_below_zero_count_from_the_face(tmp_path: Path) -> None:
     ]
 
 
-def test_a_face_has_a_texture_if_all_its_corners_have_coordinates(tmp_path: Path) -> None:
+def test_a_face_has_a_texture_if_all_its_corners_have_coordinates(tmp_path):
     (tmp_path / "a.png").write_bytes(painted((0, 255, 0)))
     path = obj(tmp_path, {"a.mtl": "newmtl m\nKd 1 0 0\nmap_Kd a.png\n"}, "vt 0 0\nvt 1 1\n")
     text = path.read_text().replace("f 1 2 3\n", "")
@@ -225,9 +223,7 @@ def test_a_face_has_a_texture_if_all_its_corners_have_coordinates(tmp_path: Path
         ("-o 3 5 -s 2", [3, 5], [5, 7]),
     ],
 )
-def test_coordinates_are_scaled_and_moved_along_each_axis(
-    tmp_path: Path, options: str, first: list[float], last: list[float]
-) -> None:
+def test_coordinates_are_scaled_and_moved_along_each_axis(tmp_path, options, first, last):
     (tmp_path / "a.png").write_bytes(painted((0, 255, 0)))
     library = f"newmtl m\nmap_Kd {options} a.png\n"
     path = obj(tmp_path, {"a.mtl": library}, "vt 0 0\nvt 1 2\nf 1/1 2/2 3/2\n")
@@ -236,7 +232,7 @@ def test_coordinates_are_scaled_and_moved_along_each_axis(
     assert colours.uv[1, :2].tolist() == [first, last]
 
 
-def test_weights_of_vertices_divide(tmp_path: Path) -> None:
+def test_weights_of_vertices_divide(tmp_path):
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0 1\nv 2 0 0 2\nv 0 3 0\nv 0 0 4 0\nf 1 2 3\nf 1 2 4\n")
     mesh = cr.load_mesh(path)
@@ -250,13 +246,13 @@ TEXTURES = "".join(f"comment TextureFile {name}.png\n" for name in ("red", "gree
 
 
 @pytest.fixture
-def pictures(tmp_path: Path) -> Path:
+def pictures(tmp_path):
     for name, colour in (("red", RED), ("green", GREEN)):
         (tmp_path / f"{name}.png").write_bytes(painted((colour[0], colour[1], colour[2])))
     return tmp_path
 
 
-def test_the_texture_of_a_polygon_is_that_of_its_triangles(pictures: Path) -> None:
+def test_the_texture_of_a_polygon_is_that_of_its_triangles(pictures):
     text = header(UV, "property int texnumber\n", count=4, comments=TEXTURES)
     faces = "4 0 1 2 3 1\n3 0 1 2 0\n3 0 1 3 -1\n3 0 2 3 -2\n"
     (pictures / "a.ply").write_text(text + rows(["0 0"] * 4) + faces)
@@ -264,7 +260,7 @@ def test_the_texture_of_a_polygon_is_that_of_its_triangles(pictures: Path) -> No
     assert textures(mesh) == [GREEN, GREEN, RED, WHITE, WHITE]
 
 
-def test_colours_of_faces_win_over_those_of_vertices(tmp_path: Path) -> None:
+def test_colours_of_faces_win_over_those_of_vertices(tmp_path):
     names = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
     text = header(names, names) + rows(["255 0 0"] * 4) + "3 0 1 2 0 0 255\n3 0 2 3 0 255 0\n"
     (tmp_path / "a.ply").write_text(text)
@@ -274,7 +270,7 @@ def test_colours_of_faces_win_over_those_of_vertices(tmp_path: Path) -> None:
 # 3MF
 
 
-def test_a_component_lies_in_the_frame_of_a_turned_item(tmp_path: Path, load: Load) -> None:
+def test_a_component_lies_in_the_frame_of_a_turned_item(tmp_path, load):
     turn = "0 1 0 -1 0 0 0 0 1"  # x becomes y
     component = '<component objectid="1" transform="1 0 0 0 1 0 0 0 1 100 0 0"/>'
     resources = solid(1) + f'<object id="2"><components>{component}</components></object>'
@@ -283,7 +279,7 @@ def test_a_component_lies_in_the_frame_of_a_turned_item(tmp_path: Path, load: Lo
     np.testing.assert_allclose(mesh.bounds, [[-10, 85, 2], [10, 115, 12]])
 
 
-def test_the_model_in_its_usual_place_is_the_first(tmp_path: Path, load: Load) -> None:
+def test_the_model_in_its_usual_place_is_the_first(tmp_path, load):
     path = threemf(tmp_path / "a.3mf", solid(1), '<item objectid="1"/>')
     for name in ("a.model", "3D/a.model", "3D/very/3dmodel_b.model"):
         with zipfile.ZipFile(path, "a") as archive:
@@ -291,7 +287,7 @@ def test_the_model_in_its_usual_place_is_the_first(tmp_path: Path, load: Load) -
     assert len(load(path)[0].faces) == 12
 
 
-def test_properties_of_a_triangle_win_over_those_of_its_object(tmp_path: Path, load: Load) -> None:
+def test_properties_of_a_triangle_win_over_those_of_its_object(tmp_path, load):
     groups = "".join(
         f'<basematerials id="{k}"><base name="a" displaycolor="{colour}"/></basematerials>'
         for k, colour in ((5, "#FF0000"), (6, "#0000FF"))
@@ -304,7 +300,7 @@ def test_properties_of_a_triangle_win_over_those_of_its_object(tmp_path: Path, l
 # URDF
 
 
-def robot(folder: Path, visual: str, joint: str = "", more: str = "") -> Path:
+def robot(folder, visual, joint="", more=""):
     path = folder / "a.urdf"
     tip = f'<link name="tip"><visual>{visual}</visual></link>'
     if joint:
@@ -314,14 +310,14 @@ def robot(folder: Path, visual: str, joint: str = "", more: str = "") -> Path:
     return path
 
 
-def wedge(folder: Path) -> str:
+def wedge(folder):
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], [[0, 1, 2], [0, 1, 3]]).export(
         folder / "wedge.stl"
     )
     return '<geometry><mesh filename="wedge.stl" scale="1 2 1"/></geometry>'
 
 
-def test_roll_comes_before_pitch_before_yaw(tmp_path: Path, load: Load) -> None:
+def test_roll_comes_before_pitch_before_yaw(tmp_path, load):
     half = math.pi / 2
     origin = f'<origin rpy="{half} 0 {half}" xyz="10 0 0"/>'
     mesh, _ = load(robot(tmp_path, wedge(tmp_path) + origin))
@@ -333,13 +329,13 @@ def test_roll_comes_before_pitch_before_yaw(tmp_path: Path, load: Load) -> None:
     np.testing.assert_allclose(mesh.bounds, [[-4, 0, -1], [0, 3, 0]], atol=1e-6)
 
 
-def test_a_visual_lies_in_its_link_and_that_at_its_joint(tmp_path: Path, load: Load) -> None:
+def test_a_visual_lies_in_its_link_and_that_at_its_joint(tmp_path, load):
     joint = f'<origin rpy="0 0 {math.pi / 2}" xyz="0 0 5"/>'
     mesh, _ = load(robot(tmp_path, wedge(tmp_path) + '<origin xyz="10 0 0"/>', joint))
     np.testing.assert_allclose(mesh.bounds, [[-4, 10, 5], [0, 11, 8]], atol=1e-6)
 
 
-def test_a_colour_of_a_visual_wins_over_a_named_one(tmp_path: Path, load: Load) -> None:
+def test_a_colour_of_a_visual_wins_over_a_named_one(tmp_path, load):
     named = '<material name="m"><color rgba="1 0 0 1"/></material>'
     own = '<material name="m"><color rgba="0 0 1 1"/></material>'
     box = '<geometry><box size="1 1 1"/></geometry>'
@@ -348,7 +344,7 @@ def test_a_colour_of_a_visual_wins_over_a_named_one(tmp_path: Path, load: Load) 
     assert first_corners(load(robot(tmp_path, box + bare, more=named))[0])[0] == RED
 
 
-def test_colours_of_a_mesh_win_over_those_of_the_urdf(tmp_path: Path, load: Load) -> None:
+def test_colours_of_a_mesh_win_over_those_of_the_urdf(tmp_path, load):
     names = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
     text = header(names, "") + rows(["0 255 0"] * 4) + "3 0 1 2\n3 0 2 3\n"
     (tmp_path / "a.ply").write_text(text)
@@ -361,7 +357,7 @@ def test_colours_of_a_mesh_win_over_those_of_the_urdf(tmp_path: Path, load: Load
 
 
 @needs_usd
-def test_helpers_and_holes_are_no_surface(tmp_path: Path, load: Load) -> None:
+def test_helpers_and_holes_are_no_surface(tmp_path, load):
     path = tmp_path / "a.usda"
     for purpose, faces in (("guide", 2), ("proxy", 2), ("render", 4), ("default", 4)):
         other = square(f'uniform token purpose = "{purpose}"').replace('"square"', '"other"')
@@ -374,7 +370,7 @@ def test_helpers_and_holes_are_no_surface(tmp_path: Path, load: Load) -> None:
 
 
 @needs_usd
-def test_a_part_of_usd_lies_in_the_frame_of_its_parent(tmp_path: Path, load: Load) -> None:
+def test_a_part_of_usd_lies_in_the_frame_of_its_parent(tmp_path, load):
     inner = square(
         "double3 xformOp:translate = (5, 0, 0)\n"
         '        uniform token[] xformOpOrder = ["xformOp:translate"]'
@@ -387,7 +383,7 @@ def test_a_part_of_usd_lies_in_the_frame_of_its_parent(tmp_path: Path, load: Loa
 
 
 @needs_usd
-def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path: Path, load: Load) -> None:
+def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path, load):
     (tmp_path / "textures").mkdir()
     (tmp_path / "textures" / "print.png").write_bytes(painted((255, 0, 0)))
     colour = 'color3f[] primvars:displayColor = [(0, 1, 0)] (interpolation = "constant")\n        '
@@ -403,9 +399,7 @@ def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path: Path, load: Loa
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
 @pytest.mark.parametrize("signs", list(itertools.product([1, -1], repeat=2)))
-def test_faces_keep_their_side_and_convex_ones_are_fans(
-    order: tuple[int, ...], signs: tuple[int, int]
-) -> None:
+def test_faces_keep_their_side_and_convex_ones_are_fans(order, signs):
     corners = np.array([[0, 0, 0], [3, 0, 0], [4, 2, 0], [2, 4, 0], [0, 2, 0]], float)
     dart = np.array([[0, 0, 0], [1, 2, 0], [0, 1, 0], [-1, 2, 0]], float)
     for flat, is_convex in ((corners, True), (dart, False)):
@@ -422,7 +416,7 @@ def test_faces_keep_their_side_and_convex_ones_are_fans(
             assert divide_faces(tilted, [range(5)]) == [[[0, 1, 2], [0, 2, 3], [0, 3, 4]]]
 
 
-def test_a_mirrored_part_keeps_its_outside_and_its_colours() -> None:
+def test_a_mirrored_part_keeps_its_outside_and_its_colours():
     colours = surface_colours(
         trimesh.Trimesh(TRIANGLE, [[0, 1, 2]], vertex_colors=[RED, GREEN, BLUE])
     )
@@ -440,7 +434,7 @@ def test_a_mirrored_part_keeps_its_outside_and_its_colours() -> None:
         assert (moved.unit, moved.up) == ("mm", "y")
 
 
-def test_transparent_texels_are_white() -> None:
+def test_transparent_texels_are_white():
     file = BytesIO()
     Image.new("RGBA", (2, 2), (200, 0, 0, 51)).save(file, "PNG")
     pixels, count = texture_pixels(file.getvalue(), 4)
@@ -462,14 +456,12 @@ def test_transparent_texels_are_white() -> None:
         ([0.0, 0.0, 0.0], [0, 0, 0]),
     ],
 )
-def test_colours_are_fractions_or_bytes(values: list[float], expected: list[int]) -> None:
+def test_colours_are_fractions_or_bytes(values, expected):
     assert colour_bytes(np.array(values)).tolist() == expected
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply"])
-def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(
-    tmp_path: Path, suffix: str
-) -> None:
+def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(tmp_path, suffix):
     shades = ["1.0024 0.2 0", "0 0.2 0", "1 0.2 0"]
     if suffix == "obj":
         points = [
@@ -485,7 +477,7 @@ def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(
     assert first_corners(mesh) == [[255, 51, 0], WHITE]
 
 
-def test_a_folder_beside_the_mesh_wins_over_one_of_textures(tmp_path: Path) -> None:
+def test_a_folder_beside_the_mesh_wins_over_one_of_textures(tmp_path):
     for folder in ("mesh", "textures"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "a.png").write_bytes(folder.encode())
@@ -497,7 +489,7 @@ def test_a_folder_beside_the_mesh_wins_over_one_of_textures(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(("suffix", "unit"), [("stl", "mm"), ("glb", "m")])
-def test_the_likely_unit_is_proposed(tmp_path: Path, suffix: str, unit: str) -> None:
+def test_the_likely_unit_is_proposed(tmp_path, suffix, unit):
     box = trimesh.creation.box((200.0, 100.0, 50.0) if suffix == "stl" else (0.2, 0.1, 0.05))
     path = tmp_path / f"a.{suffix}"
     box.export(path)
@@ -524,13 +516,13 @@ def test_the_likely_unit_is_proposed(tmp_path: Path, suffix: str, unit: str) -> 
         ),
     ],
 )
-def test_what_a_mesh_without_faces_is(tmp_path: Path, name: str, text: str, match: str) -> None:
+def test_what_a_mesh_without_faces_is(tmp_path, name, text, match):
     (tmp_path / name).write_text(text)
     with pytest.raises(MeshError, match=match):
         cr.load_mesh(tmp_path / name)
 
 
-def test_names_do_not_lead_out_of_a_folder_of_textures(tmp_path: Path) -> None:
+def test_names_do_not_lead_out_of_a_folder_of_textures(tmp_path):
     for folder in ("mesh", "textures"):
         (tmp_path / folder).mkdir()
     (tmp_path / "secret.png").write_bytes(b"secret")
@@ -541,7 +533,7 @@ def test_names_do_not_lead_out_of_a_folder_of_textures(tmp_path: Path) -> None:
         assert source.read_optional("texture", name) is None
 
 
-def test_a_mesh_of_a_robot_may_use_files_of_the_robots_folder(tmp_path: Path) -> None:
+def test_a_mesh_of_a_robot_may_use_files_of_the_robots_folder(tmp_path):
     (tmp_path / "meshes").mkdir()
     (tmp_path / "a.mtl").write_text("newmtl red")
     (tmp_path / "meshes" / "a.obj").write_text("")
@@ -551,7 +543,7 @@ def test_a_mesh_of_a_robot_may_use_files_of_the_robots_folder(tmp_path: Path) ->
     assert robot.requested == {tmp_path / "a.mtl"}
 
 
-def test_of_a_kind_of_warning_a_few_are_kept(tmp_path: Path) -> None:
+def test_of_a_kind_of_warning_a_few_are_kept(tmp_path):
     source = MeshSource(tmp_path / "a.obj")
     for k in range(8):
         source.warn("texture", f"{k} is missing")
@@ -560,7 +552,7 @@ def test_of_a_kind_of_warning_a_few_are_kept(tmp_path: Path) -> None:
     assert texts == [*(f"{k} is missing" for k in range(5)), "and more of this kind"]
 
 
-def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path: Path, load: Load) -> None:
+def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path, load):
     threemf(tmp_path / "a.3mf", solid(1), '<item objectid="1"/>', unit='unit="millimeter"')
     shape = '<geometry><mesh filename="a.3mf"/></geometry>'
     mesh, _ = load(robot(tmp_path, shape))
@@ -568,7 +560,7 @@ def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path: Path, 
     np.testing.assert_allclose(mesh.extents, [0.03, 0.02, 0.01])
 
 
-def test_colours_of_a_material_in_memory() -> None:
+def test_colours_of_a_material_in_memory():
     """Of one that states none, trimesh makes a grey, which is no colour of the mesh."""
     for material, expected in (
         (trimesh.visual.material.SimpleMaterial(diffuse=[10, 20, 30, 255]), [10, 20, 30]),
@@ -585,9 +577,7 @@ def test_colours_of_a_material_in_memory() -> None:
 @pytest.mark.parametrize(
     ("length", "is_plausible"), [(0.004, False), (0.006, True), (99.0, True), (101.0, False)]
 )
-def test_sizes_of_objects_that_are_photographed(
-    tmp_path: Path, length: float, is_plausible: bool
-) -> None:
+def test_sizes_of_objects_that_are_photographed(tmp_path, length, is_plausible):
     side = length / math.sqrt(3.0)
     trimesh.creation.box((side, side, side)).export(tmp_path / "a.stl")
     with warnings.catch_warnings(record=True) as caught:
@@ -596,7 +586,7 @@ def test_sizes_of_objects_that_are_photographed(
     assert (caught == []) == is_plausible
 
 
-def test_objects_of_one_number_in_two_models_are_no_copies(tmp_path: Path, load: Load) -> None:
+def test_objects_of_one_number_in_two_models_are_no_copies(tmp_path, load):
     inner = threemf(tmp_path / "inner.3mf", solid(1), "")
     with zipfile.ZipFile(inner) as archive:
         content = archive.read("3D/3dmodel.model")

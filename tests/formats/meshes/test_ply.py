@@ -1,7 +1,6 @@
 """PLY files as scanners write them."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,24 +17,20 @@ POINTS = [(0, 0, 0), (4, 0, 0), (4, 2, 0), (0, 2, 0)]
 SHADES = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (51, 102, 153)]
 
 
-def header(
-    vertex: str, face: str, *, count: int = 2, comments: str = "", kind: str = "ascii"
-) -> str:
+def header(vertex, face, *, count=2, comments="", kind="ascii"):
     columns = "".join(f"property float {axis}\n" for axis in "xyz") + vertex
     text = f"ply\nformat {kind} 1.0\n{comments}element vertex 4\n{columns}element face {count}\n"
     return f"{text}property list uchar int vertex_indices\n{face}end_header\n"
 
 
-def rows(extra: list[str]) -> str:
+def rows(extra):
     return "".join(f"{x} {y} {z} {more}\n" for (x, y, z), more in zip(POINTS, extra, strict=True))
 
 
 @pytest.mark.parametrize("prefix", ["", "diffuse_"])
 @pytest.mark.parametrize("short", [False, True])
 @pytest.mark.parametrize("kind", ["uchar", "float", "ushort"])
-def test_colours_under_every_name(
-    tmp_path: Path, load: Load, prefix: str, short: bool, kind: str
-) -> None:
+def test_colours_under_every_name(tmp_path, load, prefix, short, kind):
     names = [
         f"{prefix}{name[0] if short and not prefix else name}" for name in ("red", "green", "blue")
     ]
@@ -50,7 +45,7 @@ def test_colours_under_every_name(
     np.testing.assert_array_equal(colours.corners, np.array(SHADES)[mesh.faces])
 
 
-def test_colours_of_16_bits_are_scaled(tmp_path: Path, load: Load) -> None:
+def test_colours_of_16_bits_are_scaled(tmp_path, load):
     vertex = "".join(f"property ushort {name}\n" for name in ("red", "green", "blue"))
     extra = [" ".join(str(257 * shade) for shade in shades) for shades in SHADES]
     (tmp_path / "a.ply").write_text(header(vertex, "") + rows(extra) + "3 0 1 2\n3 0 2 3\n")
@@ -60,14 +55,14 @@ def test_colours_of_16_bits_are_scaled(tmp_path: Path, load: Load) -> None:
     np.testing.assert_array_equal(colours.corners, np.array(SHADES)[mesh.faces])
 
 
-def pictures(folder: Path) -> list[np.ndarray]:
+def pictures(folder):
     found = [np.random.default_rng(k).integers(0, 255, (8, 8, 3), np.uint8) for k in range(2)]
     for k, pixels in enumerate(found):
         Image.fromarray(pixels).save(folder / f"{k}.png")
     return found
 
 
-def test_two_textures_are_read_or_named(tmp_path: Path, load: Load) -> None:
+def test_two_textures_are_read_or_named(tmp_path, load):
     pixels = pictures(tmp_path)
     comments = "comment TextureFile 0.png\ncomment TextureFile 1.png\n"
     face = "property list uchar float texcoord\n"
@@ -96,9 +91,7 @@ def test_two_textures_are_read_or_named(tmp_path: Path, load: Load) -> None:
 
 
 @pytest.mark.parametrize("names", [("s", "t"), ("u", "v"), ("texture_u", "texture_v")])
-def test_texture_coordinates_of_vertices(
-    tmp_path: Path, load: Load, names: tuple[str, str]
-) -> None:
+def test_texture_coordinates_of_vertices(tmp_path, load, names):
     (pixels, _) = pictures(tmp_path)
     vertex = "".join(f"property float {name}\n" for name in names)
     text = header(vertex, "", count=1, comments="comment TextureFile 0.png\n")
@@ -113,7 +106,7 @@ def test_texture_coordinates_of_vertices(
     )
 
 
-def test_concave_faces_keep_their_texture_coordinates(tmp_path: Path, load: Load) -> None:
+def test_concave_faces_keep_their_texture_coordinates(tmp_path, load):
     pictures(tmp_path)
     text = header(
         "", "property list uchar float texcoord\n", comments="comment TextureFile 0.png\n"
@@ -137,7 +130,7 @@ POINT = [(0, 0, 0), (1, 2, 0), (0, 1, 0), (-1, 2, 0)]
 
 
 @pytest.mark.parametrize("encoding", ["latin-1", "gbk", "utf-8", "utf-8-sig"])
-def test_remarks_in_any_encoding(tmp_path: Path, load: Load, encoding: str) -> None:
+def test_remarks_in_any_encoding(tmp_path, load, encoding):
     name = "外壳" if encoding == "gbk" else "Gehäuse"
     pixels = pictures(tmp_path)
     Image.fromarray(pixels[0]).save(tmp_path / f"{name}.png")
@@ -163,13 +156,13 @@ def test_remarks_in_any_encoding(tmp_path: Path, load: Load, encoding: str) -> N
         header("", "").replace("float x", "float q") + rows([""] * 4),
     ],
 )
-def test_damaged_files_are_refused(tmp_path: Path, content: str) -> None:
+def test_damaged_files_are_refused(tmp_path, content):
     (tmp_path / "a.ply").write_text(content)
     with pytest.raises(MeshError, match=r"a\.ply"):
         cr.load_mesh(tmp_path / "a.ply")
 
 
-def test_headers_of_many_columns_are_refused(tmp_path: Path) -> None:
+def test_headers_of_many_columns_are_refused(tmp_path):
     columns = "".join(f"property list uchar float a{k}\n" for k in range(501))
     (tmp_path / "a.ply").write_text(header(columns, "", kind="binary_little_endian"))
     with pytest.raises(MeshError, match="more than 500 kinds of rows or columns"):
@@ -192,8 +185,8 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_time_grows_with_the_size(tmp_path: Path, load: Load, kind: str) -> None:
-    def written(n: int) -> Path:
+def test_time_grows_with_the_size(tmp_path, load, kind):
+    def written(n):
         path = tmp_path / "a.ply"
         path.write_text(HOSTILE[kind](n))
         return path

@@ -1,7 +1,6 @@
 """Polygons become triangles; what trimesh reads wrongly is rewritten or refused."""
 
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from curvireg_torch.formats.meshes.polygons import divide_faces
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
 
 
-def square_with_hole(n: int) -> np.ndarray:
+def square_with_hole(n):
     square = np.array([[0, 0], [10, 0], [10, 10], [0, 10.0]])
     angle = -np.linspace(0, 2 * np.pi, n, endpoint=False) - 3 * np.pi / 4
     hole = 5 + 2 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -25,7 +24,7 @@ def square_with_hole(n: int) -> np.ndarray:
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_divide_faces_covers_polygons_once(axis: int, sign: int) -> None:
+def test_divide_faces_covers_polygons_once(axis, sign):
     rng = np.random.default_rng(0)
     turns = [
         np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, n))) * rng.uniform(0.2, 1, n)
@@ -45,14 +44,14 @@ def test_divide_faces_covers_polygons_once(axis: int, sign: int) -> None:
         assert area == pytest.approx(expected * 1.18**0.5, rel=1e-9)
 
 
-def prism() -> tuple[np.ndarray, list[list[int]]]:
+def prism():
     """A U of 3 x 3, 1 thick: two concave ends, eight walls."""
     vertices = np.concatenate([np.insert(U, 2, 0.0, axis=1), np.insert(U, 2, 1.0, axis=1)])
     walls = [[i, (i + 1) % 8, 8 + (i + 1) % 8, 8 + i] for i in range(8)]
     return vertices, [list(range(7, -1, -1)), list(range(8, 16)), *walls]
 
 
-def write(path: Path, kind: str) -> None:
+def write(path, kind):
     vertices, faces = prism()
     points = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in vertices)
     lists = "".join(f"{len(f)} {' '.join(map(str, f))}\n" for f in faces)
@@ -89,7 +88,7 @@ KINDS = ["off", "off with colours", "obj", "obj counted back", "obj continued", 
 KINDS += ["ply", "ply with colours"]
 
 
-def silhouette(mesh: trimesh.Trimesh) -> int:
+def silhouette(mesh):
     T = torch.eye(4, dtype=torch.float64)
     T[:3, 3] = torch.tensor([-1.5, -1.5, 8.0])
     K = cr.camera_matrix(80.0, 80.0, 31.5, 31.5, dtype=torch.float64)
@@ -97,7 +96,7 @@ def silhouette(mesh: trimesh.Trimesh) -> int:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_load_mesh_leaves_the_gap_of_a_concave_face_open(tmp_path: Path, kind: str) -> None:
+def test_load_mesh_leaves_the_gap_of_a_concave_face_open(tmp_path, kind):
     vertices, faces = prism()
     path = tmp_path / f"u.{kind[:3]}"
     write(path, kind)
@@ -109,7 +108,7 @@ def test_load_mesh_leaves_the_gap_of_a_concave_face_open(tmp_path: Path, kind: s
         assert (mesh.metadata["colours"].corners == [255, 0, 0]).all()
 
 
-def test_divided_faces_of_an_obj_keep_texture_coordinates_at_their_corners(tmp_path: Path) -> None:
+def test_divided_faces_of_an_obj_keep_texture_coordinates_at_their_corners(tmp_path):
     path = tmp_path / "u.obj"
     write(path, "obj with texture")
     pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3) * 5
@@ -122,7 +121,7 @@ def test_divided_faces_of_an_obj_keep_texture_coordinates_at_their_corners(tmp_p
     assert mesh.area == pytest.approx(30)
 
 
-def binary_ply(faces: list[list[int]], vertices: np.ndarray) -> bytes:
+def binary_ply(faces, vertices):
     header = f"ply\nformat binary_big_endian 1.0\nelement vertex {len(vertices)}\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz") + f"element face {len(faces)}\n"
     body = vertices.astype(">f4").tobytes() + b"".join(
@@ -131,7 +130,7 @@ def binary_ply(faces: list[list[int]], vertices: np.ndarray) -> bytes:
     return f"{header}property list uchar int vertex_indices\nend_header\n".encode() + body
 
 
-def test_load_mesh_reads_binary_ply_of_one_number_of_corners(tmp_path: Path) -> None:
+def test_load_mesh_reads_binary_ply_of_one_number_of_corners(tmp_path):
     vertices, faces = prism()
     path = tmp_path / "u.ply"
     path.write_bytes(binary_ply(faces[:2], vertices))
@@ -153,7 +152,7 @@ SIDES = [[1, 2, 4, 3], [5, 7, 8, 6], [1, 5, 6, 2], [3, 4, 8, 7], [1, 3, 7, 5], [
 
 @pytest.mark.parametrize("line", ["f {}", "  f {}", "\tf {}", "f {} # side", "f\t{}"])
 @pytest.mark.parametrize("triangles", [True, False])
-def test_load_mesh_reads_every_face_of_an_obj(tmp_path: Path, line: str, triangles: bool) -> None:
+def test_load_mesh_reads_every_face_of_an_obj(tmp_path, line, triangles):
     """trimesh drops indented faces and refuses comments behind them."""
     faces = [
         f for a, b, c, d in SIDES for f in ([[a, b, c], [a, c, d]] if triangles else [[a, b, c, d]])
@@ -169,7 +168,7 @@ def test_load_mesh_reads_every_face_of_an_obj(tmp_path: Path, line: str, triangl
 
 
 @pytest.mark.parametrize("face", ["f 0 1 2", "f 1 2 0", "f 3/1/1 0/1/1 1/1/1", "f 0 1 2 3"])
-def test_load_mesh_refuses_obj_that_counts_from_0(tmp_path: Path, face: str) -> None:
+def test_load_mesh_refuses_obj_that_counts_from_0(tmp_path, face):
     path = tmp_path / "a.obj"
     path.write_text(f"{BOX}{face}\n")
     with pytest.raises(MeshError, match="vertex 0; OBJ files count from 1"):
@@ -177,7 +176,7 @@ def test_load_mesh_refuses_obj_that_counts_from_0(tmp_path: Path, face: str) -> 
 
 
 @pytest.mark.parametrize("kind", ["off", "obj", "ply"])
-def test_load_mesh_refuses_damaged_polygons(tmp_path: Path, kind: str) -> None:
+def test_load_mesh_refuses_damaged_polygons(tmp_path, kind):
     path = tmp_path / f"u.{kind[:3]}"
     write(path, kind)
     data = path.read_bytes()

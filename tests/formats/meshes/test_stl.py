@@ -2,7 +2,6 @@
 
 import struct
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,13 +15,13 @@ Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 BOX = trimesh.creation.box((3.0, 2.0, 1.0))
 
 
-def binary(header: bytes = b"exported", claimed: int = 12, tail: bytes = b"") -> bytes:
+def binary(header=b"exported", claimed=12, tail=b""):
     corners = np.asarray(BOX.triangles, "<f4")
     records = b"".join(struct.pack("<12x") + one.tobytes() + b"\0\0" for one in corners)
     return header.ljust(80) + struct.pack("<I", claimed) + records + tail
 
 
-def ascii_stl(name: str = "part", point: str = "  vertex {:.4f} {:.4f} {:.4f}\n") -> str:
+def ascii_stl(name="part", point="  vertex {:.4f} {:.4f} {:.4f}\n"):
     facets = "".join(
         "facet normal 0 0 0\n outer loop\n"
         + "".join(point.format(*corner) for corner in one)
@@ -32,7 +31,7 @@ def ascii_stl(name: str = "part", point: str = "  vertex {:.4f} {:.4f} {:.4f}\n"
     return f"solid {name}\n{facets}endsolid {name}\n"
 
 
-def check(mesh: trimesh.Trimesh) -> None:
+def check(mesh):
     assert (len(mesh.faces), mesh.extents.round(6).tolist()) == (12, [3.0, 2.0, 1.0])
     assert mesh.volume == pytest.approx(6.0, rel=1e-6)
 
@@ -42,30 +41,28 @@ def check(mesh: trimesh.Trimesh) -> None:
     [b"exported", b"solid Part1", b"solid facet vertex", "solid Gehäuse".encode("latin-1")],
 )
 @pytest.mark.parametrize("tail", [b"", b"\r\n"])
-def test_the_header_of_a_binary_file_says_nothing(
-    tmp_path: Path, load: Load, header: bytes, tail: bytes
-) -> None:
+def test_the_header_of_a_binary_file_says_nothing(tmp_path, load, header, tail):
     (tmp_path / "a.stl").write_bytes(binary(header, tail=tail))
     mesh, texts = load(tmp_path / "a.stl")
     check(mesh)
     assert not texts
 
 
-def test_faces_behind_the_last_one_are_named(tmp_path: Path, load: Load) -> None:
+def test_faces_behind_the_last_one_are_named(tmp_path, load):
     (tmp_path / "a.stl").write_bytes(binary(claimed=5))
     mesh, texts = load(tmp_path / "a.stl")
     assert len(mesh.faces) == 5
     assert "it says 5 faces and holds 12: the others are left out" in texts[0]
 
 
-def test_text_that_is_no_stl_is_not_taken_for_a_binary_file(tmp_path: Path) -> None:
+def test_text_that_is_no_stl_is_not_taken_for_a_binary_file(tmp_path):
     (tmp_path / "a.stl").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n" * 9)
     with pytest.raises(MeshError, match="is no STL file"):
         cr.load_mesh(tmp_path / "a.stl")
 
 
 @pytest.mark.parametrize("cut", [1, 49, 50, 120, 599])
-def test_a_binary_file_that_is_cut_is_refused(tmp_path: Path, cut: int) -> None:
+def test_a_binary_file_that_is_cut_is_refused(tmp_path, cut):
     (tmp_path / "a.stl").write_bytes(binary()[:-cut])
     with pytest.raises(MeshError, match=r"says 12 faces and holds .*cut while it was written"):
         cr.load_mesh(tmp_path / "a.stl")
@@ -103,14 +100,14 @@ def test_a_binary_file_that_is_cut_is_refused(tmp_path: Path, cut: int) -> None:
         "blank",
     ],
 )
-def test_ascii_files_of_every_encoding(tmp_path: Path, load: Load, content: bytes) -> None:
+def test_ascii_files_of_every_encoding(tmp_path, load, content):
     (tmp_path / "a.stl").write_bytes(content)
     mesh, texts = load(tmp_path / "a.stl")
     check(mesh)
     assert not texts
 
 
-def test_an_ascii_file_that_is_cut_short_says_so(tmp_path: Path, load: Load) -> None:
+def test_an_ascii_file_that_is_cut_short_says_so(tmp_path, load):
     text = ascii_stl()
     (tmp_path / "a.stl").write_text(text[: text.rindex("endsolid")])
     mesh, texts = load(tmp_path / "a.stl")
@@ -141,7 +138,7 @@ def test_an_ascii_file_that_is_cut_short_says_so(tmp_path: Path, load: Load) -> 
         (b"nothing of the kind", "too early"),
     ],
 )
-def test_damaged_files_are_refused(tmp_path: Path, content: bytes, match: str) -> None:
+def test_damaged_files_are_refused(tmp_path, content, match):
     (tmp_path / "a.stl").write_bytes(content)
     with pytest.raises(MeshError, match=match):
         cr.load_mesh(tmp_path / "a.stl")
@@ -156,8 +153,8 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_time_grows_with_the_size(tmp_path: Path, kind: str) -> None:
-    def written(n: int) -> Path:
+def test_time_grows_with_the_size(tmp_path, kind):
+    def written(n):
         path = tmp_path / "a.stl"
         path.write_text(HOSTILE[kind](n))
         return path

@@ -4,7 +4,6 @@ import base64
 import json
 from collections.abc import Callable
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,7 +30,7 @@ FORMATS |= {
 }
 
 
-def encoded(kind: str, size: tuple[int, int] = (8, 8), **how: object) -> bytes:
+def encoded(kind, size=(8, 8), **how):
     if kind == "EPS":
         return POSTSCRIPT
     pixels = np.random.default_rng(0).integers(0, 255, (*size[::-1], 3), np.uint8)
@@ -40,7 +39,7 @@ def encoded(kind: str, size: tuple[int, int] = (8, 8), **how: object) -> bytes:
     return file.getvalue()
 
 
-def write(folder: Path, carrier: str, picture: bytes) -> Path:
+def write(folder, carrier, picture):
     """A mesh of one format whose texture is called a.png, whatever it holds."""
     (folder / "a.png").write_bytes(picture)
     if carrier == "obj":
@@ -73,10 +72,8 @@ def write(folder: Path, carrier: str, picture: bytes) -> Path:
 
 @pytest.mark.parametrize("carrier", ["obj", "ply", "gltf", "data"])
 @pytest.mark.parametrize("kind", FORMATS)
-def test_only_the_formats_of_photographs_are_decoded(
-    tmp_path: Path, load: Load, monkeypatch: pytest.MonkeyPatch, carrier: str, kind: str
-) -> None:
-    def refuse(*words: object, **how: object) -> None:
+def test_only_the_formats_of_photographs_are_decoded(tmp_path, load, monkeypatch, carrier, kind):
+    def refuse(*words, **how):
         raise AssertionError(f"a program is started: {words} {how}")
 
     monkeypatch.setattr("subprocess.Popen", refuse)
@@ -88,7 +85,7 @@ def test_only_the_formats_of_photographs_are_decoded(
     assert all("not an image that is read" in text for text in texts)
 
 
-def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path: Path) -> None:
+def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path):
     (tmp_path / "a.eps").write_bytes(POSTSCRIPT)
     mesh = trimesh.creation.box()
     with Image.open(tmp_path / "a.eps") as picture:
@@ -97,9 +94,7 @@ def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path: Path) -> None:
             assert surface_colours(mesh) is None or not has_colours(mesh)
 
 
-def test_pixels_of_all_textures_together_are_bounded(
-    tmp_path: Path, load: Load, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pixels_of_all_textures_together_are_bounded(tmp_path, load, monkeypatch):
     picture = encoded("PNG", (40, 25))
     path = write(tmp_path, "obj", picture)
     library = "".join(f"newmtl m{k}\nmap_Kd {k}.png\n" for k in range(4))
@@ -125,9 +120,7 @@ def test_pixels_of_all_textures_together_are_bounded(
     assert not load(path)[1]
 
 
-def test_a_texture_of_many_pixels_or_scans_is_left_out(
-    tmp_path: Path, load: Load, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_texture_of_many_pixels_or_scans_is_left_out(tmp_path, load, monkeypatch):
     path = write(tmp_path, "obj", encoded("PNG", (200, 100)))
     monkeypatch.setattr("curvireg_torch.utils.pictures.MAX_IMAGE_PIXELS", 19_999)
     assert "pixels; scale it down" in load(path)[1][0]
@@ -141,7 +134,7 @@ def test_a_texture_of_many_pixels_or_scans_is_left_out(
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I;16"])
-def test_large_textures_are_reduced_in_every_mode(mode: str) -> None:
+def test_large_textures_are_reduced_in_every_mode(mode):
     """Before they are converted to RGBA, which would take four times the memory."""
     image = (
         Image.new("L", (6400, 5600), 255).convert(mode)
@@ -157,6 +150,6 @@ def test_large_textures_are_reduced_in_every_mode(mode: str) -> None:
     assert int(pixels.min()) >= 254 or mode == "CMYK"
 
 
-def test_a_mesh_without_any_colour_has_none(tmp_path: Path) -> None:
+def test_a_mesh_without_any_colour_has_none(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n")
     assert surface_colours(cr.load_mesh(tmp_path / "a.obj")) is None

@@ -3,7 +3,6 @@
 import zipfile
 from collections.abc import Callable
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -62,18 +61,16 @@ MAP = """rel material:binding = </part/paint>
 """
 
 
-def square(more: str = "", api: str = "", counts: str = "4", indices: str = "0, 1, 2, 3") -> str:
+def square(more="", api="", counts="4", indices="0, 1, 2, 3"):
     return SQUARE.format(more=more, api=api, counts=counts, indices=indices)
 
 
-def stage(
-    *parts: str, about: str = 'metersPerUnit = 0.001\n    upAxis = "Z"', place: str = ""
-) -> str:
+def stage(*parts, about='metersPerUnit = 0.001\n    upAxis = "Z"', place=""):
     body = "\n".join(parts)
     return f'#usda 1.0\n(\n    {about}\n)\ndef Xform "part"\n{{\n{place}{body}\n}}\n'
 
 
-def png() -> bytes:
+def png():
     pixels = np.zeros((8, 8, 3), np.uint8)
     pixels[:4] = 255, 0, 0
     pixels[4:] = 0, 0, 255
@@ -82,7 +79,7 @@ def png() -> bytes:
     return file.getvalue()
 
 
-def package(path: Path, text: str, **more: bytes) -> Path:
+def package(path, text, **more):
     """A USDZ: a zip without compression, whose contents begin at multiples of 64 bytes."""
     with zipfile.ZipFile(path, "w") as file:
         for name, content in {"part.usda": text.encode(), **more}.items():
@@ -94,7 +91,7 @@ def package(path: Path, text: str, **more: bytes) -> Path:
     return path
 
 
-def test_places_units_axes_and_polygons(tmp_path: Path, load: Load) -> None:
+def test_places_units_axes_and_polygons(tmp_path, load):
     path = tmp_path / "part.usda"
     place = (
         "    double3 xformOp:translate = (10, 0, 5)\n    double3 xformOp:rotateXYZ = (90, 0, 0)\n"
@@ -118,9 +115,7 @@ def test_places_units_axes_and_polygons(tmp_path: Path, load: Load) -> None:
         ('upAxis = "Z"', "cm", "z", 2.0),  # not stated: OpenUSD's centimetres
     ],
 )
-def test_units_and_axes_are_those_of_the_stage(
-    tmp_path: Path, load: Load, about: str, unit: str, up: str, width: float
-) -> None:
+def test_units_and_axes_are_those_of_the_stage(tmp_path, load, about, unit, up, width):
     path = tmp_path / "part.usda"
     path.write_text(stage(square(), about=about))
     mesh, _ = load(path)
@@ -130,7 +125,7 @@ def test_units_and_axes_are_those_of_the_stage(
         assert load(path, unit="mm")[0].units == "mm"
 
 
-def test_colours_of_the_mesh(tmp_path: Path, load: Load) -> None:
+def test_colours_of_the_mesh(tmp_path, load):
     colours = "color3f[] primvars:displayColor = [(1, 0, 0), (0, 0, 1)]"
     more = colours + ' (interpolation = "uniform")'
     path = tmp_path / "part.usda"
@@ -143,7 +138,7 @@ def test_colours_of_the_mesh(tmp_path: Path, load: Load) -> None:
 
 
 @pytest.mark.parametrize("kind", ["usda", "usdz"])
-def test_textures_by_the_coordinates_that_they_name(tmp_path: Path, load: Load, kind: str) -> None:
+def test_textures_by_the_coordinates_that_they_name(tmp_path, load, kind):
     text = stage(MATERIAL, square(MAP, BOUND))
     path = tmp_path / f"part.{kind}"
     if kind == "usda":
@@ -167,19 +162,19 @@ def test_textures_by_the_coordinates_that_they_name(tmp_path: Path, load: Load, 
         assert any("print.png is missing" in text for text in load(path)[1])
 
 
-def painted(colour: tuple[int, int, int]) -> bytes:
+def painted(colour):
     file = BytesIO()
     Image.new("RGB", (4, 4), colour).save(file, "PNG")
     return file.getvalue()
 
 
-def textures_of(mesh: trimesh.Trimesh) -> list[list[int]]:
+def textures_of(mesh):
     colours = surface_colours(mesh)
     assert colours is not None
     return [texture[0, 0].tolist() for texture in colours.textures]
 
 
-def test_textures_lie_beside_the_file_that_names_them(tmp_path: Path, load: Load) -> None:
+def test_textures_lie_beside_the_file_that_names_them(tmp_path, load):
     """A file of the same name beside the first one is another texture."""
     for folder, colour in ((".", (255, 0, 0)), ("blue", (0, 0, 255))):
         (tmp_path / folder / "textures").mkdir(parents=True)
@@ -203,7 +198,7 @@ def test_textures_lie_beside_the_file_that_names_them(tmp_path: Path, load: Load
         assert (textures_of(mesh), texts) == ([[0, 255, 0]], [])
 
 
-def test_a_texture_whose_file_is_an_input_of_the_material(tmp_path: Path, load: Load) -> None:
+def test_a_texture_whose_file_is_an_input_of_the_material(tmp_path, load):
     (tmp_path / "print.png").write_bytes(painted((1, 2, 3)))
     named = MATERIAL.replace(
         "asset inputs:file = @textures/print.png@",
@@ -215,7 +210,7 @@ def test_a_texture_whose_file_is_an_input_of_the_material(tmp_path: Path, load: 
     assert textures_of(load(tmp_path / "part.usda")[0]) == [[1, 2, 3]]
 
 
-def test_textures_are_scaled(tmp_path: Path, load: Load) -> None:
+def test_textures_are_scaled(tmp_path, load):
     (tmp_path / "textures").mkdir()
     (tmp_path / "textures" / "print.png").write_bytes(painted((255, 255, 255)))
     path = tmp_path / "part.usda"
@@ -233,7 +228,7 @@ def test_textures_are_scaled(tmp_path: Path, load: Load) -> None:
         assert colours.corners[0, 0].tolist() == tint
 
 
-def test_references_stay_in_the_folder(tmp_path: Path, load: Load) -> None:
+def test_references_stay_in_the_folder(tmp_path, load):
     (tmp_path / "in").mkdir()
     part = '#usda 1.0\n(\n    defaultPrim = "part"\n)\ndef Xform "part"\n{' + square() + "}\n"
     (tmp_path / "in" / "other.usda").write_text(part)
@@ -265,13 +260,13 @@ def test_references_stay_in_the_folder(tmp_path: Path, load: Load) -> None:
         ),
     ],
 )
-def test_what_is_not_read_is_refused(tmp_path: Path, load: Load, text: str, match: str) -> None:
+def test_what_is_not_read_is_refused(tmp_path, load, text, match):
     (tmp_path / "part.usda").write_text(text)
     with pytest.raises(MeshError, match=match):
         load(tmp_path / "part.usda")
 
 
-def test_other_parts_are_named(tmp_path: Path, load: Load) -> None:
+def test_other_parts_are_named(tmp_path, load):
     hidden = square('token visibility = "invisible"').replace('"square"', '"hidden"')
     (tmp_path / "part.usda").write_text(stage(square(), '    def Cube "a" {}', hidden))
     mesh, texts = load(tmp_path / "part.usda")
@@ -279,7 +274,7 @@ def test_other_parts_are_named(tmp_path: Path, load: Load) -> None:
     assert any("no meshes are left out (Cube)" in text for text in texts)
 
 
-def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bounds(tmp_path, monkeypatch):
     path = tmp_path / "part.usda"
     path.write_text(stage(square()))
     for name, value, match in (
@@ -294,7 +289,7 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.undo()
 
 
-def test_the_message_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_message_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setattr(extras, "find_spec", lambda _: None)
     (tmp_path / "part.usdz").write_text("a part")
     with pytest.raises(MissingDependencyError, match=r"pip install 'curvireg_torch\[usd\]'"):
