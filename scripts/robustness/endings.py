@@ -151,6 +151,8 @@ def _become(words: list[str], writer: int) -> NoReturn:
         sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
         sys.argv = ["curvireg", *words]
         code = command_line()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
     except BaseException:  # of the command: it is printed, as Python would
         traceback.print_exc()
     finally:

@@ -3,7 +3,7 @@ import os
 import pytest
 import torch
 
-from curvireg_torch import Registrar
+from curvireg_torch import Registrar, rotation_error
 from curvireg_torch.errors import CurviregError, InvalidInputError, WorkerError
 from curvireg_torch.utils.executors import Workers
 from tests._support.scenes import CAMERA, scene, truck_bank
@@ -23,12 +23,17 @@ def test_processes_give_the_results_of_one_in_the_same_order(tmp_path):
     expected = Registrar(truck_bank())(images, boxes, CAMERA)
     registrar = Registrar(truck_bank(), workers=2)
     _ = registrar.describer  # renderers cannot be pickled
-    for results in (registrar(images, boxes, CAMERA), registrar(images, boxes, CAMERA)):
-        for result, other in zip(results[:3], expected[:3], strict=True):
-            assert torch.equal(result.transform, other.transform)
-            assert result.score == other.score
-        assert str(results[3].error) == str(expected[3].error)
-        assert isinstance(results[3].error, CurviregError)
+    both = [registrar(images, boxes, CAMERA) for _ in range(2)]
+    for one, again, other in zip(*both, expected, strict=True):
+        if other.ok:  # one process registers them in one block, which changes rounding
+            assert torch.equal(one.transform, again.transform)
+            assert float(rotation_error(one.rotation, other.rotation)) < 0.05
+            assert one.translation.tolist() == pytest.approx(other.translation.tolist(), rel=1e-3)
+            assert one.score == pytest.approx(other.score, abs=1e-3)
+        else:
+            assert isinstance(one.error, CurviregError)
+            assert str(one.error) == str(again.error) == str(other.error)
+    assert [result.ok for result in expected] == [True, True, True, False]
 
 
 @pytest.mark.slow
