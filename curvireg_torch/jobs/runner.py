@@ -9,6 +9,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
 from tqdm import tqdm
 
 from ..errors import (
@@ -23,6 +24,7 @@ from ..errors import (
 from ..formats.meshes.files import mesh_digest
 from ..registration import Registrar
 from ..registration.result import verdict_of_error
+from ..registration.stages import share_of_worker
 from ..utils.executors import Workers
 from ..utils.files import file_digest, text_digest, write_file
 from ..utils.sources import package_digest
@@ -39,9 +41,6 @@ NOT_IN_RESULTS = ("cli", "viewer", "visualization")
 
 OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]
 """Opens the registrar of some mesh files; it is sent to workers by pickle."""
-
-BLOCK = 8  # photographs on a CPU that a worker gets, and whose rows it returns, at a time
-GPU_BLOCK = 64
 
 
 def results_digest() -> str:
@@ -104,8 +103,8 @@ def run_entries(
         for place, meshes in enumerate(dict.fromkeys(entry.meshes for entry in entries))
     }
     in_order = sorted(entries, key=lambda entry: order[entry.meshes])
-    most = GPU_BLOCK if settings.get("device", "cpu") != "cpu" else BLOCK
-    size = max(1, min(most, len(entries) // (2 * workers.count)))
+    device = torch.device(settings.get("device") or "cpu").type
+    size = share_of_worker(len(entries), workers.count, device)
     with tqdm(desc=label, unit="photo", total=len(entries), disable=not progress) as bar:
 
         def blocks() -> Iterator[list[Task]]:

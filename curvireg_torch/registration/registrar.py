@@ -26,12 +26,10 @@ from .photograph import Photograph, as_photographs
 from .refinement import refine
 from .result import FailedRegistration, Registration
 from .several import register_views
-from .stages import map_photographs, register_photographs
+from .stages import map_photographs, register_photographs, share_of_worker
 from .target import Target
 
 __all__ = ["Registrar"]
-
-MAX_BLOCK = 8  # photographs that a worker gets at a time
 
 Results = list[Registration | FailedRegistration]
 
@@ -289,7 +287,7 @@ def _register_by_workers(
     """:meth:`.Registrar.register_prepared` by workers, which get a copy of the registrar each; a
     photograph that ends them fails."""
     tasks = [_Task(number, item, detects) for number, item in enumerate(items)]
-    size = max(1, min(MAX_BLOCK, len(tasks) // (2 * workers.count)))
+    size = share_of_worker(len(tasks), workers.count)
     blocks = (tasks[start : start + size] for start in range(0, len(tasks), size))
     found: dict[int, Registration | FailedRegistration] = {}
     for task, result in workers.map(_register_block, _quiet_copy(registrar), blocks):

@@ -59,6 +59,22 @@ Chosen, not measured."""
 BLOCK_OF_DEVICE = 64
 
 
+def _block_size(device: str) -> int:
+    """Photographs in a block on a kind of device."""
+    return BLOCK.get(device, BLOCK_OF_DEVICE)
+
+
+def share_of_worker(photographs: int, workers: int, device: str = "cpu") -> int:
+    """How many of some photographs a worker gets at a time: a block, or fewer, so that each gets
+    two shares.
+
+    Example:
+        >>> share_of_worker(100, 2), share_of_worker(12, 2)
+        (8, 3)
+    """
+    return max(1, min(_block_size(device), photographs // (2 * workers)))
+
+
 def register_photographs(
     target: Target,
     items: Sequence[Photograph | CurviregError],
@@ -67,7 +83,7 @@ def register_photographs(
     """Register photographs with boxes, in blocks, each to the best of the target and ``others``;
     one that cannot be registered fails alone. Items are read on demand, so that few are in
     memory."""
-    size = BLOCK.get(target.bank.device.type, BLOCK_OF_DEVICE)
+    size = _block_size(target.bank.device.type)
     results: list[Registration | FailedRegistration] = []
     meshes = (target, *others)
     with exact_convolutions():
