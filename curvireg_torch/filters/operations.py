@@ -277,7 +277,7 @@ def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = 
     """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite
     differences need it: ``linear`` by the slope at the borders, else by replicating them."""
     readable = not isinstance(sigma, Tensor) or is_host_readable(sigma)
-    if linear or prefers_shifts(x, sigma) or not readable:
+    if linear or prefers_shifts() or not readable:
         weights = _gaussian_kernel(sigma, x)
         pad = _extrapolate_pad if linear else replicate_pad
         return _weighted_shifts(pad(x, len(weights) // 2 + margin), weights)
@@ -295,14 +295,10 @@ def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = 
     return blurred
 
 
-def prefers_shifts(*inputs: Tensor | float) -> bool:
-    """Whether sums of shifted images take the place of kornia's convolutions: in graphs, where they
-    fuse with what surrounds them, and on a CPU where gradients are wanted, since those of
-    convolutions of a single channel are slow (docs/kornia.md has the times)."""
-    if torch.compiler.is_compiling():
-        return True
-    wanted = [x for x in inputs if isinstance(x, Tensor) and x.requires_grad]
-    return torch.is_grad_enabled() and any(x.device.type == "cpu" for x in wanted)
+def prefers_shifts() -> bool:
+    """Whether sums of shifted images take the place of kornia's Gaussian: in graphs, where they
+    fuse with what surrounds them (docs/kornia.md has the times)."""
+    return torch.compiler.is_compiling()
 
 
 def _weighted_shifts(x: Tensor, weights: Sequence[float] | Tensor) -> Tensor:
@@ -369,17 +365,11 @@ def _extrapolate_pad(x: Tensor, radius: int) -> Tensor:
 
 
 def central_gradient(p: Tensor) -> tuple[Tensor, Tensor]:
-    """(p_x, p_y) per px by central differences; the result is 1 px smaller than p on each side."""
-    if prefers_shifts(p):
-        return _half_difference(p[..., 1:-1, 2:], p[..., 1:-1, :-2]), _half_difference(
-            p[..., 2:, 1:-1], p[..., :-2, 1:-1]
-        )
-    from kornia.filters import spatial_gradient  # here, because its import takes 0.3 s
-
-    with full_precision(p), _without_tf32(p):
-        found: Tensor = spatial_gradient(p, "diff", 1)
-    x, y = found[..., 1:-1, 1:-1].unbind(2)  # the border has replicated neighbours
-    return x, y
+    """(p_x, p_y) per px by central differences; the result is 1 px smaller than p on each side.
+    kornia's take several times as long (docs/kornia.md)."""
+    return _half_difference(p[..., 1:-1, 2:], p[..., 1:-1, :-2]), _half_difference(
+        p[..., 2:, 1:-1], p[..., :-2, 1:-1]
+    )
 
 
 def central_derivatives(p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

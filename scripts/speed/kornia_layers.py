@@ -19,6 +19,7 @@ from typing import Any
 
 import kornia
 import torch
+from kornia.filters import spatial_gradient
 from torch import Tensor, nn
 
 import curvireg_torch as cr
@@ -45,29 +46,41 @@ LAYERS: dict[str, nn.Module] = {
 """Those of photographs; of depth, nothing is kornia's."""
 
 
-def _yes(*_: object) -> bool:
+def _yes() -> bool:
     return True
 
 
-def _no(*_: object) -> bool:
+def _no() -> bool:
     return False
 
 
+def kornia_gradient(p: Tensor) -> tuple[Tensor, Tensor]:
+    """``ops.central_gradient`` by kornia."""
+    found: Tensor = spatial_gradient(p, "diff", 1)
+    x, y = found[..., 1:-1, 1:-1].unbind(2)  # the border has replicated neighbours
+    return x, y
+
+
 @contextmanager
-def computed(*, by_kornia: bool) -> Iterator[None]:
-    """Within, filters are kornia's or sums of shifted images, whatever the library prefers."""
-    before = ops.prefers_shifts
+def computed(*, by_kornia: bool, gradient: bool = False) -> Iterator[None]:
+    """Within, Gaussians are kornia's or sums of shifted images, whatever the library prefers; with
+    ``gradient`` first derivatives are kornia's too."""
+    before = ops.prefers_shifts, ops.central_gradient
     # one object each, by which a graph is known again
     ops.prefers_shifts = _no if by_kornia else _yes
+    if gradient:
+        ops.central_gradient = kornia_gradient
     try:
         yield
     finally:
-        ops.prefers_shifts = before
+        ops.prefers_shifts, ops.central_gradient = before
 
 
-def chosen(function: Callable[..., Any], by_kornia: bool, *arguments: Any) -> Any:
+def chosen(
+    function: Callable[..., Any], by_kornia: bool, *arguments: Any, gradient: bool = False
+) -> Any:
     """``function(*arguments)`` with either kind of filters."""
-    with computed(by_kornia=by_kornia):
+    with computed(by_kornia=by_kornia, gradient=gradient):
         return function(*arguments)
 
 
@@ -109,6 +122,10 @@ def measure_layer(
     ):
         calls = [functools.partial(run, function, x) for function in functions]
         entry[name] = paired(calls, rounds, seconds)
+        if not compiled:
+            all_kornia = functools.partial(chosen, module, True, gradient=True)
+            calls = [calls[0], functools.partial(run, all_kornia, x)]
+            entry[f"{name} with gradient"] = paired(calls, rounds, seconds)
     return entry
 
 
@@ -138,13 +155,14 @@ def measure_bank(preset: str, rounds: int) -> dict[str, Any]:
 
 def table(record: dict[str, Any]) -> list[str]:
     """Lines of the tables: layers, then commands."""
-    rows = [["layer", "forward", "both", "compiled, forward", "both", "difference"]]
+    columns = ["forward", "both", "with its gradient, forward", "both", "compiled, forward", "both"]
+    rows = [["layer", *columns, "difference"]]
     for name in LAYERS:
         eager = record["eager"].get(name, {})
         graph = record["compiled"].get(name, {})
         ratios = [
-            f"{entry[run]['ratio']:.2f}" if entry else "-"
-            for entry in (eager, graph)
+            f"{entry[f'{run}{what}']['ratio']:.2f}" if f"{run}{what}" in entry else "-"
+            for entry, what in ((eager, ""), (eager, " with gradient"), (graph, ""))
             for run in ("forward", "both")
         ]
         shown = f"{eager['difference']:.0e}" if eager else "-"
