@@ -5,9 +5,9 @@ arbitrary. Each function has a module twin with the same options. The dtype is k
 compute in float32). Wrong shapes, dtypes, masks and options raise
 :class:`~curvireg_torch.errors.InvalidInputError`.
 
-Grey levels and Gaussians of photographs are kornia's. In graphs and for depth, and for all
-derivatives, sums of shifted images give the same in less time (``docs/kornia.md`` has the
-measurements).
+Grey levels and Gaussians of photographs are kornia's. For derivatives and depth, in graphs, and on
+a CPU where gradients are wanted, sums of shifted images give the same in less time
+(``docs/kornia.md`` has the measurements).
 """
 
 from .curvilinear import (

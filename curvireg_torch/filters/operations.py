@@ -277,7 +277,7 @@ def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = 
     """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite
     differences need it: ``linear`` by the slope at the borders, else by replicating them."""
     readable = not isinstance(sigma, Tensor) or is_host_readable(sigma)
-    if linear or prefers_shifts() or not readable:
+    if linear or prefers_shifts(x, sigma) or not readable:
         weights = _gaussian_kernel(sigma, x)
         pad = _extrapolate_pad if linear else replicate_pad
         return _weighted_shifts(pad(x, len(weights) // 2 + margin), weights)
@@ -295,10 +295,14 @@ def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = 
     return blurred
 
 
-def prefers_shifts() -> bool:
+def prefers_shifts(*inputs: Tensor | float) -> bool:
     """Whether sums of shifted images take the place of kornia's Gaussian: in graphs, where they
-    fuse with what surrounds them (docs/kornia.md has the times)."""
-    return torch.compiler.is_compiling()
+    fuse with what surrounds them, and on a CPU where gradients are wanted, since those of
+    convolutions of a single channel are slow (docs/kornia.md has the times)."""
+    if torch.compiler.is_compiling():
+        return True
+    wanted = [x for x in inputs if isinstance(x, Tensor) and x.requires_grad]
+    return torch.is_grad_enabled() and any(x.device.type == "cpu" for x in wanted)
 
 
 def _weighted_shifts(x: Tensor, weights: Sequence[float] | Tensor) -> Tensor:
