@@ -102,6 +102,7 @@ def test_photograph_may_be_large_and_of_any_dtype(monkeypatch):
     assert float((found.T - T)[:3, 3].norm()) < 0.02 * 4.0
 
 
+@pytest.mark.slow
 def test_photograph_may_be_dark():
     T = pose(20.0, 0.3, 6.0)
     bright = photograph(T)

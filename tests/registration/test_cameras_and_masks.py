@@ -14,6 +14,7 @@ from curvireg_torch.geometry.cameras import boxes_around
 from curvireg_torch.registration import FailedRegistration, Follower, detect
 from curvireg_torch.registration.photograph import as_photograph, as_photographs
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
+from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_registrar
 
 # The object, in the middle of the picture, is 20 degrees off its axis, where distortion moves it
@@ -49,7 +50,7 @@ def distorted(camera, seed):
 
 
 @pytest.mark.parametrize("camera", [RADIAL, FISHEYE], ids=["radial-tangential", "fisheye"])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", slow_after(1, [1, 2]))
 def test_distorted_photograph_gives_the_pose_of_the_true_camera(camera, seed):
     ideal, photo, box, _, T = distorted(camera, seed)
     true_box = undistorted(photo, camera, box).box[None]
