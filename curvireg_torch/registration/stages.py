@@ -53,9 +53,10 @@ from .target import Target
 
 Result = Registration | CurviregError
 
-BLOCK = {"cpu": 8}
+BLOCK = {"cpu": 16}
 """Photographs in a block by the kind of device; their crops and pictures are in memory together.
-Chosen, not measured."""
+Measured on a CPU, 16 photographs of one mesh: blocks of 16 take 9 to 12 % less processor time than
+blocks of 8, and 4 to 8 % more memory (1.14 GB at 640 x 480, 1.71 GB at 4000 x 3000)."""
 BLOCK_OF_DEVICE = 64
 
 
@@ -70,7 +71,7 @@ def share_of_worker(photographs: int, workers: int, device: str = "cpu") -> int:
 
     Example:
         >>> share_of_worker(100, 2), share_of_worker(12, 2)
-        (8, 3)
+        (16, 3)
     """
     return max(1, min(_block_size(device), photographs // (2 * workers)))
 
