@@ -92,7 +92,8 @@ class Workers:
         try:
             yield from run.results(iter(blocks))
         except BaseException:
-            run.cancel()
+            if self._executor is not None:  # a pool that ends reports on its futures itself
+                run.cancel()
             self.end()  # what they are still working on belongs to no later call
             raise
 

@@ -128,6 +128,21 @@ def test_our_warnings_are_given_here():
     assert [warning.category for warning in caught] == [CurviregWarning]
 
 
+def test_blocks_of_processes_are_left_to_their_pool(monkeypatch):
+    """Where it finds cancelled ones while its processes end, it prints a traceback."""
+    futures = []
+    workers = Workers(2)
+    monkeypatch.setattr(workers, "submit", lambda *_: futures.append(Future()) or futures[-1])
+
+    def blocks():
+        yield [1]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(workers.map(doubled, None, blocks()))
+    assert [future.cancelled() for future in futures] == [False]
+
+
 def test_few_blocks_wait_at_a_time(monkeypatch):
     monkeypatch.setattr(executors, "BLOCKS_OF_A_CLUSTER", 2)
     taken = []
@@ -190,7 +205,7 @@ def check_killed_worker(workers, folder):
 
 
 PARENT = """
-import os, sys, time
+import os, signal, sys, time
 from pathlib import Path
 from curvireg_torch.utils.executors import Workers
 from curvireg_torch.utils.files import terminable
@@ -200,6 +215,7 @@ def work(folder, tasks):
     time.sleep(300)
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
     with terminable(), Workers(2) as workers:
         list(workers.map(work, Path(sys.argv[1]), [[1], [2]]))
 """
