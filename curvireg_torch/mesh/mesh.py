@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import wraps
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 import torch
@@ -299,6 +299,14 @@ def mirrored(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, mesh.faces[:, [0, 2, 1]], process=False)
 
 
+class _Measures(dict[str, Any]):
+    """Measures of a geometry, by name. Copies of a mesh share them: one may be the mesh itself, and
+    none changes."""
+
+    def __deepcopy__(self, memo: Any) -> Self:
+        return self
+
+
 def measures_of(mesh: trimesh.Trimesh) -> dict[str, Any]:
     """What is known of a mesh with these vertices and faces, by the names of the functions that
     measure it; it travels with the mesh, as its metadata do. Banks store such values.
@@ -311,9 +319,9 @@ def measures_of(mesh: trimesh.Trimesh) -> dict[str, Any]:
         (['extreme_points'], [])
     """
     geometry = hash(mesh)
-    of_geometry, known = mesh.metadata.get("measures", (None, {}))
+    of_geometry, known = mesh.metadata.get("measures", (None, None))
     if of_geometry != geometry:
-        known = {}
+        known = _Measures()
         mesh.metadata["measures"] = geometry, known
     return cast(dict[str, Any], known)
 

@@ -390,9 +390,9 @@ def _typed_numbers(text: str, count: int) -> tuple[float, ...] | None:
     decimal ones.
 
     Example:
-        >>> typed_numbers("536,8 538,2 310,4 241", 4), typed_numbers("300, 300, 160, 120", 4)
+        >>> _typed_numbers("536,8 538,2 310,4 241", 4), _typed_numbers("300, 300, 160, 120", 4)
         ((536.8, 538.2, 310.4, 241.0), (300.0, 300.0, 160.0, 120.0))
-        >>> typed_numbers("65,5°", 1), typed_numbers("", 1), typed_numbers("300 300", 4)
+        >>> _typed_numbers("65,5°", 1), _typed_numbers("", 1), _typed_numbers("300 300", 4)
         ((65.5,), (), None)
     """
     words = [word for word in re.split(r"[\s;]+|,\s+", text.strip().rstrip("°")) if word]

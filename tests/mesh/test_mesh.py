@@ -222,6 +222,12 @@ def test_measures_are_those_of_the_mesh_as_it_is_now():
     assert float(points.abs().max()) == 1.5, "callers have copies"
     known = measures_of(pickle.loads(pickle.dumps(mesh)))
     assert torch.equal(known["extreme_points"], points), "they travel with the mesh"
+    measures_of(mesh)["view_mesh"] = mesh  # one that needs no simplification
+    other = mesh.copy()
+    assert measures_of(other) is measures_of(mesh), "copies have the same"
+    other.vertices *= 3.0
+    assert torch.equal(extreme_points(other), 3.0 * points)
+    assert torch.equal(extreme_points(mesh), points)
     mesh.vertices *= 2.0
     assert measures_of(mesh) == {}
     assert torch.equal(extreme_points(mesh), 2.0 * points)
