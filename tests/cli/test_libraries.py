@@ -36,6 +36,9 @@ def test_ctrl_c_while_libraries_are_loaded_interrupts_the_command(module: str) -
 import signal, sys
 from curvireg_torch.cli.libraries import load_libraries
 
+# a shell's background jobs ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 class Interrupting:
     @staticmethod
     def find_spec(name, *_):
