@@ -33,6 +33,7 @@ exclude_patterns = ["_build", "gallery", "notebooks"]
 nitpicky = True
 nitpick_ignore = [  # types of annotations without a page
     ("py:class", "Image"),
+    ("py:class", "curvireg_torch.data._base.Transforms"),
     ("py:class", "curvireg_torch.matching.cells.Packing"),
     ("py:class", "curvireg_torch.mesh.round_axis.RoundAxis"),
     ("py:class", "curvireg_torch.fitting.exactness.Exactness"),
