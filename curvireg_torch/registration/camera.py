@@ -343,7 +343,7 @@ CLEAR_DEVIATION = 0.15
 
 CONTRADICTION = 2.0
 """Standard deviations from which a given focal length is named: those that are stated are large, of
-16 fits to generated photographs none below ``CLEAR_DEVIATION`` was more than 1.5 of them off."""
+13 fits to generated photographs that were clear none was more than 1.5 of them off."""
 
 SMALLEST_GAP = 0.14
 """Difference of log f, 15 % of the distance, up to which a focal length is not named."""

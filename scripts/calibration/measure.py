@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from itertools import groupby
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 from unittest.mock import patch
 
 import numpy as np
@@ -30,6 +30,7 @@ from curvireg_torch.registration.confidence import are_near
 from scripts.calibration.sets import ESTIMATED, GREY, MODELS, SETS, UPRIGHT, photographs_of
 
 Row: TypeAlias = dict[str, Any]
+Task = TypeVar("Task")
 
 RIGHT = 30.0  # degrees within which a registration is right
 # and fraction of the distance, within which a refined or tracked pose is right
@@ -96,10 +97,8 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
         [h.rotation if K is not None else h.allocentric_rotation for h in result.hypotheses]
     )
     if K is None:  # compare as seen by a camera that looks straight at the object
-        ray = sample["rotation"].double() @ model_centre(sample) + sample["translation"].double()
-        seen = sample | {
-            "rotation": cr.geometry.rotation_towards(ray).T @ sample["rotation"].double()
-        }
+        straight = cr.geometry.rotation_towards(true_centre(sample))
+        seen = sample | {"rotation": straight.T @ sample["rotation"].double()}
     evidence = Evidence.of_hypotheses([h.evidence for h in result.hypotheses])
     scores = evidence.scores(registrar.score_weights(exact=registrar.is_exact))
     S = symmetries_of(sample, registrar if registrar.is_exact else None)
@@ -108,19 +107,17 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
     is_rival[0] = True
     row = {"features": dict(result.confidence_features), "scores": scores[is_rival].tolist()}
     row |= {"evidence": evidence.table[is_rival].tolist()}
-    row |= {"errors": errors_of(R, seen, S)[is_rival].tolist()}
+    errors = errors_of(R, seen, S)
+    row |= {"errors": errors[is_rival].tolist()}
     row |= {"mirror": judging.MIRROR_WARNING in result.warnings}
     best = result.hypotheses[0]
     is_unique = len(S) == 1  # else the covariance is that of another pose
     if gaps:  # logarithm of the shown focal length over the given one, and its deviation
         row["focal gap"] = gaps[0]
-    row |= groups_of(result, registrar, seen["rotation"].double() @ R[0].T, errors_of(R, seen, S))
+    row |= groups_of(result, registrar, seen["rotation"].double() @ R[0].T, errors)
     if best.covariance is not None and is_unique and row["errors"][0] < RIGHT:
         if (said := best.exactness) is not None:
-            centre = (
-                sample["rotation"].double() @ model_centre(sample) + sample["translation"].double()
-            )
-            distance = best.distance / float(centre.norm())
+            distance = best.distance / float(true_centre(sample).norm())
             turned = said.rotation_deg if K is not None else said.allocentric_deg
             row["errors in radii"] = [row["errors"][0] / turned]
             row["errors in radii"] += [100.0 * abs(distance - 1.0) / said.distance_percent]
@@ -164,12 +161,13 @@ def groups_of(
     return row
 
 
-def model_centre(sample: Row) -> Tensor:
-    """(3,) middle of the model's box, in mm."""
+def true_centre(sample: Row) -> Tensor:
+    """(3,) middle of the model's box at the true pose, in mm."""
     info = sample["model_info"]
-    return torch.tensor(
+    middle = torch.tensor(
         [info[f"min_{c}"] + 0.5 * info[f"size_{c}"] for c in "xyz"], dtype=torch.float64
     )
+    return sample["rotation"].double() @ middle + sample["translation"].double()
 
 
 def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
@@ -283,8 +281,6 @@ def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[
     data = BOPDataset(folder)
     annotations = [data.annotation(i) for i in range(len(data))]
     listed = [(int(s["scene_id"]), int(s["obj_id"]), i) for i, s in enumerate(annotations)][:limit]
-    done = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
-    known = {tuple(row["task"]) for row in done}
 
     def mesh_and_pose(entry: tuple[int, int, int]) -> tuple[int, int]:
         # of these, make.py alternates upright and any pose
@@ -294,14 +290,27 @@ def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[
     tasks = []
     for key, group in groupby(sorted(listed, key=mesh_and_pose), key=mesh_and_pose):
         indices = [i for _, _, i in group]
-        if key not in known:
-            scenes = {scene for scene, obj_id, _ in listed if obj_id == key[0]}
-            beside = next((i for scene, _, i in listed if scene not in scenes), 0)
-            tasks.append((key, (kind, folder, "any" if key[1] else "upright", indices, beside)))
+        scenes = {scene for scene, obj_id, _ in listed if obj_id == key[0]}
+        beside = next((i for scene, _, i in listed if scene not in scenes), 0)
+        tasks.append((key, (kind, folder, "any" if key[1] else "upright", indices, beside)))
+    return measured(out, tasks, measure, jobs, kind)
+
+
+def measured(
+    out: Path,
+    tasks: Sequence[tuple[Any, Task]],
+    measure_one: Callable[[Task], list[Row]],
+    jobs: int,
+    name: str,
+) -> list[Row]:
+    """Rows of tasks with keys, and of those that a file holds; finished ones are kept in it."""
+    done = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    known = {json.dumps(entry["task"]) for entry in done}
+    new = [(key, task) for key, task in tasks if json.dumps(key) not in known]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, out.open("a") as file:
-        found = pool.map(measure, [task for _, task in tasks])
+        found = pool.map(measure_one, [task for _, task in new])
         for (key, _), rows in zip(
-            tasks, tqdm(found, total=len(tasks), desc=kind, unit="mesh"), strict=True
+            new, tqdm(found, total=len(new), desc=name, unit="mesh"), strict=True
         ):
             done.append({"task": key, "rows": rows})
             file.write(json.dumps(done[-1]) + "\n")

@@ -17,15 +17,14 @@ are kept. Each kind misleads in one or several ways:
 
 An answer is wrong by more than 30 degrees, by more than 15 % of the distance where a camera is
 given, or if its mesh is another one: of a variant, the pose of the shared parts is right. An axis
-is wrong beyond its tolerance. "ordinary" are photographs with their own camera: of those whose
-confidence is high enough, the share that warnings cost. Writes scripts/results/misleading.json.
+is wrong beyond its tolerance. "ordinary" are photographs with their own camera; some are
+"confident", of a high enough confidence, and yet not called reliable. Writes
+scripts/results/misleading.json.
 """
 
 import argparse
 import json
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -33,7 +32,6 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
@@ -44,10 +42,11 @@ from scripts.calibration.measure import (
     Row,
     errors_of,
     groups_of,
+    measured,
     mesh_of,
-    model_centre,
     recorded_gaps,
     symmetries_of,
+    true_centre,
 )
 
 ALONE = ("ordinary", "camera", "cropped", "sizes")
@@ -155,11 +154,10 @@ def answer_of(
     S = symmetries_of(sample, registrar)
     R = torch.stack([h.rotation.double() for h in result.hypotheses])
     errors = errors_of(R, sample, S)
-    centre = sample["rotation"].double() @ model_centre(sample) + sample["translation"].double()
     row: Row = {"verdict": result.verdict, "reliable": result.reliable}
     row |= {"confidence": result.confidence, "warnings": list(result.warnings)}
     row |= {"degrees": float(errors[0]), "mesh_is_right": result.mesh_index == right_mesh}
-    row["distance"] = float(result.distance) / float(centre.norm()) - 1.0
+    row["distance"] = float(result.distance) / float(true_centre(sample).norm()) - 1.0
     row |= groups_of(result, registrar, sample["rotation"].double() @ R[0].T, errors)
     row["wrong"] = bool(
         errors[0] > WRONG_DEGREES
@@ -260,22 +258,13 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", choices=SOURCES, default=list(SOURCES))
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
+    tasks = [
+        ([folder.name, kinds, indices], (folder, kinds, indices))
+        for name in options.sets
+        for folder, kinds, indices in tasks_of(options.work, name, options.each)
+    ]
     out = options.work / "misleading.jsonl"
-    done = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
-    known = {json.dumps(entry["task"]) for entry in done}
-    tasks = [task for name in options.sets for task in tasks_of(options.work, name, options.each)]
-    named = [[folder.name, kinds, indices] for folder, kinds, indices in tasks]
-    new = [k for k, name in enumerate(named) if json.dumps(name) not in known]
-    with (
-        ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool,
-        out.open("a") as file,
-    ):
-        found = pool.map(measure, [tasks[k] for k in new])
-        for k, rows in zip(new, tqdm(found, total=len(new), unit="mesh"), strict=True):
-            done.append({"task": named[k], "rows": rows})
-            file.write(json.dumps(done[-1]) + "\n")
-            file.flush()
-    rows = [row for entry in done for row in entry["rows"]]
+    rows = measured(out, tasks, measure, options.jobs, "misleading")
     misleading = [row for row in rows if row["kind"] != "ordinary"]
     ways = sorted({(row["kind"], row["way"]) for row in rows})
     record: Row = {"date": today(), "commit": commit(), "misleading": table_of(misleading)}

@@ -48,11 +48,7 @@ def footed(rng: Rng) -> list[Part]:
     """A box or a disc with a block under one end."""
     w, d, h = rng.uniform((0.7, 0.5, 0.15), (1.2, 0.7, 0.6))
     round_body = rng.random() < 0.4
-    body = (
-        lathe(np.full(2, 0.5 * w), np.array([0.0, h]))
-        if round_body
-        else box((w, d, h)).moved((0, 0, 0.5 * h))
-    )
+    body = _body(w, d, h, 0.5 * w if round_body else None)
     block = box(rng.uniform((0.1, 0.1, 0.03), (0.2, 0.25, 0.08)))
     return [(body, 0), (block.moved((0.3 * w, 0, -0.02)), 0)]
 
@@ -61,11 +57,7 @@ def marked(rng: Rng) -> list[Part]:
     """A box or a cylinder with a small cube on one end of its top."""
     w, d, h = rng.uniform((0.8, 0.4, 0.3), (1.2, 0.7, 0.7))
     round_body = rng.random() < 0.3
-    body = (
-        lathe(np.full(2, 0.4 * w), np.array([0.0, h]))
-        if round_body
-        else box((w, d, h)).moved((0, 0, 0.5 * h))
-    )
+    body = _body(w, d, h, 0.4 * w if round_body else None)
     side = rng.uniform(0.05, 0.14)
     at = 0.4 * w - 0.5 * side if not round_body else 0.3 * w
     return [(body, 0), (box(side).moved((at, 0, h + 0.5 * side)), 0)]
@@ -75,11 +67,7 @@ def plated(rng: Rng) -> list[Part]:
     """A plate or a disc with a flat block, 0.03 to 0.05 radii high, on one end of its top."""
     w, d, h = rng.uniform((0.9, 0.6, 0.08), (1.2, 0.9, 0.3))
     round_body = rng.random() < 0.3
-    body = (
-        lathe(np.full(2, 0.5 * w), np.array([0.0, h]))
-        if round_body
-        else box((w, d, h)).moved((0, 0, 0.5 * h))
-    )
+    body = _body(w, d, h, 0.5 * w if round_body else None)
     radius = 0.5 * float(np.linalg.norm((w, w if round_body else d, h)))
     long, wide = rng.uniform(0.12, 0.3, 2)
     high = rng.uniform(0.03, 0.05) * radius
@@ -96,6 +84,13 @@ def handed(rng: Rng) -> list[Part]:
     reach = rng.uniform(0.3, 0.6)
     pin = bar((-0.3 * long, 0, 0), (-0.3 * long, 0.5 * wide + reach, 0), rng.uniform(0.04, 0.09))
     return [(plate, 0), (arm, 0), (pin, 0)]
+
+
+def _body(width: float, depth: float, height: float, radius: float | None) -> Surface:
+    """A cylinder if there is a radius, else a box; it stands on z = 0."""
+    if radius is not None:
+        return lathe(np.full(2, radius), np.array([0.0, height]))
+    return box((width, depth, height)).moved((0, 0, 0.5 * height))
 
 
 def _without_bottom(size: tuple[float, float, float], at: tuple[float, float, float]) -> Surface:
