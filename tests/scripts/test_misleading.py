@@ -1,8 +1,17 @@
 """Photographs that mislead, by their known changes."""
 
+from argparse import Namespace
+from math import radians
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
 
+from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.registration.result import Axis
+from scripts.benchmark.make import PART_AREA, TWIN, Variants
+from scripts.calibration.measure import groups_of, measured
 from scripts.calibration.misleading import (
     BARREL,
     CROPPED,
@@ -150,3 +159,63 @@ def test_an_answer_is_wrong_by_its_angle_its_distance_or_its_mesh(small_bank):
     turned = cr.geometry.rotation_from_axis_angle(torch.tensor([0.0, 0.7, 0.0]).double())
     other = row | {"rotation": turned @ row["rotation"]}
     assert answer_of(result, registrar, other, None, 0)["wrong"]
+
+
+def test_pairs_and_axes_are_right_within_their_bounds():
+    axis = Axis(torch.tensor([0.0, 0.0, 1.0]).double(), 0.9)
+    result = SimpleNamespace(pair_probability=0.8, probabilities=(0.5, 0.0, 0.3, 0.1), axis=axis)
+    errors = torch.tensor([150.0, 5.0, 29.0, 3.0])
+
+    def judged(degrees, *, ends_are_alike=False):
+        turn = rotation_from_axis_angle(torch.tensor([radians(degrees), 0.0, 0.0]).double())
+        registrar = SimpleNamespace(round_axis=SimpleNamespace(ends_are_alike=ends_are_alike))
+        return groups_of(result, registrar, turn, errors)
+
+    assert judged(14.0) == {"pair": [0.8, True], "axis": [0.9, True]}
+    assert judged(16.0)["axis"] == [0.9, False]
+    assert judged(170.0)["axis"] == [0.9, False]
+    assert judged(170.0, ends_are_alike=True)["axis"] == [0.9, True]
+    errors[2] = 31.0
+    assert judged(0.0)["pair"] == [0.8, False], (
+        "of those with a probability, the third does not count"
+    )
+
+
+def test_finished_tasks_are_kept(tmp_path):
+    out = tmp_path / "rows.jsonl"
+    tasks = [([k, "a"], k) for k in (1, 2)]
+    assert measured(out, tasks, doubled, 1, "") == [{"value": 2}, {"value": 4}]
+    assert measured(out, [([3, "a"], 3), *tasks], failing_beyond_two, 1, "") == [
+        {"value": 2},
+        {"value": 4},
+        {"value": 6},
+    ]
+
+
+def doubled(task):
+    return [{"value": 2 * task}]
+
+
+def failing_beyond_two(task):
+    assert task > 2, "it was finished"
+    return doubled(task)
+
+
+def test_a_variant_differs_in_one_part():
+    shapes = Variants(Namespace(seed=112, models=12, cad="variant"))
+    low, high = PART_AREA
+    assert len(shapes.ids) >= 6
+    left_out = 0
+    for obj_id in shapes.ids:
+        shown = shapes.mesh(obj_id)
+        variant = shapes.mesh(obj_id + TWIN)
+        sides = shown.triangles[:, 1:] - shown.triangles[:, :1]
+        area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+        if len(variant.triangles) < len(shown.triangles):
+            left_out += 1
+            kept = {tuple(triangle.ravel()) for triangle in variant.triangles}
+            differs = np.array([tuple(t.ravel()) not in kept for t in shown.triangles])
+        else:
+            differs = (variant.triangles != shown.triangles).any(axis=(1, 2))
+        assert low <= area[differs].sum() / area.sum() <= high
+    assert left_out < len(shapes.ids)
