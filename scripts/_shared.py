@@ -1,5 +1,6 @@
-"""Helpers that several scripts use: records, tables and timing."""
+"""Helpers that several scripts use: options, records, tables and timing."""
 
+import argparse
 import datetime
 import json
 import os
@@ -19,6 +20,13 @@ WRITTEN = ("scripts/results", "docs", "README.md")
 """Paths that scripts write to. A change there does not affect what a script measures."""
 
 
+def parser_of(description: str | None) -> argparse.ArgumentParser:
+    """A parser of options whose help is a script's docstring as it is written."""
+    return argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+
+
 def update_page(page: Path, name: str, body: str) -> None:
     """Write ``body`` between the markers ``name:begin`` and ``name:end`` of a Markdown page."""
     begin = f"<!-- {name}:begin -->"
@@ -36,6 +44,10 @@ def table_lines(cells: Sequence[Sequence[str]]) -> list[str]:
     return [lines[0], "|---" * len(cells[0]) + "|", *lines[1:]]
 
 
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
 def write_json(path: Path, content: Any, indent: int = 2) -> None:
     """Write a record, and create its folder if needed; an interrupted run leaves no half of a
     file."""
@@ -43,6 +55,11 @@ def write_json(path: Path, content: Any, indent: int = 2) -> None:
     part = path.with_name(f"{path.name}.{os.getpid()}")
     part.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
     part.replace(path)
+
+
+def stamp() -> dict[str, Any]:
+    """The first entries of a record: when it was measured, and of which checkout."""
+    return {"date": today(), "commit": commit()}
 
 
 def today() -> str:

@@ -8,7 +8,6 @@ the errors. Their rows replace those of the same sets in scripts/results/confide
 table is written from it.
 """
 
-import argparse
 import csv
 import json
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,16 @@ from typing import Any
 
 from sklearn.metrics import roc_auc_score
 
-from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
+from scripts._shared import (
+    REPOSITORY,
+    RESULTS,
+    parser_of,
+    read_json,
+    stamp,
+    table_lines,
+    update_page,
+    write_json,
+)
 
 RIGHT = 30.0  # degrees
 ERROR_COLUMNS = ("rotation", "symmetric_error_deg")  # of BOP sets and of PASCAL3D+
@@ -62,20 +70,18 @@ GENERATED = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("run", nargs="*", type=Path, help="folder of curvireg evaluate")
     options = parser.parse_args()
     page = REPOSITORY / "docs" / "accuracy.md"
-    calibration = json.loads((RESULTS / "calibration.json").read_text(encoding="utf-8"))
+    calibration = read_json(RESULTS / "calibration.json")
     update_page(page, "generated", generated_part(calibration))
     update_page(page, "withheld", table_of_withheld(calibration["held out"]["instance"]["sets"]))
     if options.run:
         path = RESULTS / "confidence.json"
-        stored = json.loads(path.read_text(encoding="utf-8"))["sets"] if path.exists() else []
+        stored = read_json(path)["sets"] if path.exists() else []
         rows = merged(stored, [measured(run) for run in options.run])
-        record = {"date": today(), "commit": commit(), "sets": rows}
+        record = stamp() | {"sets": rows}
         write_json(path, record)
         update_page(page, "confidence", table(rows))
 

@@ -10,14 +10,21 @@ A stored summary contains the date and the commit at which it was recorded ("+":
 changes), so record it right after measuring.
 """
 
-import argparse
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
+from scripts._shared import (
+    REPOSITORY,
+    RESULTS,
+    parser_of,
+    read_json,
+    stamp,
+    table_lines,
+    update_page,
+    write_json,
+)
 
 PASCAL3D = (
     "set | N | Acc 30° | Acc 10° | median | Acc 30°, symmetric | easy: Acc 30° | median",
@@ -62,9 +69,7 @@ LIGHTINGS = {"hope": 5, "hope_print": 5}  # per view; objects of these sets are 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument(
         "--record", nargs=2, metavar=("SUMMARY", "NAME"), help="store a summary.json under a name"
     )
@@ -88,8 +93,8 @@ def main() -> None:
 def record(summary: Path, name: str) -> Path:
     """Store ``summary`` with the date and the commit; returns the path."""
     path = RESULTS / f"evaluation_{name}.json"
-    content = json.loads(summary.read_text(encoding="utf-8"))
-    write_json(path, {"name": name, "date": today(), "commit": commit(), "summary": content})
+    content = read_json(summary)
+    write_json(path, {"name": name, **stamp(), "summary": content})
     return path
 
 
@@ -105,15 +110,10 @@ def comparison(summaries: Sequence[Path], results: Path) -> str:
     rows = [["set", "N", "score", "stored", "now"]]
     for path in summaries:
         name = path.parent.name
-        measured = json.loads(path.read_text(encoding="utf-8"))
-        stored_path = results / f"evaluation_{name}.json"
-        stored = (
-            json.loads(stored_path.read_text(encoding="utf-8"))["summary"]
-            if stored_path.exists()
-            else {}
-        )
+        measured = read_json(path)
+        earlier = stored(results / f"evaluation_{name}.json").get("summary", {})
         for key in COMPARED[measured["settings"]["dataset"]]:
-            values = [score(summary.get(key), key) for summary in (stored, measured)]
+            values = [score(summary.get(key), key) for summary in (earlier, measured)]
             rows.append([name, str(measured["n"]), key, *values])
     return "\n".join(table_lines(rows))
 
@@ -126,7 +126,7 @@ def score(value: float | None, key: str) -> str:
 def stored_records(results: Path) -> list[dict[str, Any]]:
     """The stored summaries, by name."""
     paths = sorted(results.glob("evaluation_*.json"))
-    return [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+    return [read_json(path) for path in paths]
 
 
 def table_in_words(results: Path) -> str:
@@ -156,7 +156,7 @@ def table_in_words(results: Path) -> str:
 
 def stored(path: Path) -> dict[str, Any]:
     """A record, empty if there is none."""
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return read_json(path) if path.exists() else {}
 
 
 def video_row(videos: Sequence[Mapping[str, Any]]) -> list[str]:

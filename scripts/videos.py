@@ -7,7 +7,6 @@ and t in the mesh's unit, mm. The box of the first frame is that of the true pos
 the symmetries of the shape.
 """
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -19,26 +18,24 @@ from curvireg_torch.data import read_image
 from curvireg_torch.evaluation.metrics import symmetric_rotation_error
 from curvireg_torch.geometry import projected_boxes, transform
 from curvireg_torch.registration import Follower
-from scripts._shared import RESULTS, commit, today, write_json
+from scripts._shared import RESULTS, parser_of, read_json, stamp, write_json
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("folder", nargs="+", type=Path)
     parser.add_argument("--record", action="store_true", help="store it for the README's table")
     options = parser.parse_args()
     videos = [followed(folder) for folder in options.folder]
     print(json.dumps(videos, indent=2))
     if options.record:
-        record = {"date": today(), "commit": commit(), "videos": videos}
+        record = stamp() | {"videos": videos}
         write_json(RESULTS / "videos.json", record)
 
 
 def followed(folder: Path) -> dict[str, Any]:
     """Name of a video; of its frames errors in degrees, inf without a pose, and verdicts."""
-    values = json.loads((folder / "camera.json").read_text())
+    values = read_json(folder / "camera.json")
     K = cr.camera_matrix(*(values[name] for name in ("fx", "fy", "cx", "cy")))
     registrar = cr.Registrar(cr.load_mesh(folder / "mesh.ply", unit="mm"))
     symmetries = registrar.symmetries_of(exact=True)[:, :3, :3]
@@ -46,7 +43,7 @@ def followed(folder: Path) -> dict[str, Any]:
     box = None
     errors = []
     verdicts = []
-    for name, pose in json.loads((folder / "truth.json").read_text()).items():
+    for name, pose in read_json(folder / "truth.json").items():
         T = transform(*(torch.tensor(pose[key]).double() for key in ("R", "t")))
         is_first = not errors
         box = projected_boxes(registrar.describer.hull, T[None], K)[0] if is_first else None

@@ -18,9 +18,8 @@ run can be resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette inside
 object for scripts/calibration.
 """
 
-import argparse
-import json
 import shutil
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -38,7 +37,7 @@ from tqdm import tqdm
 
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.mesh import mesh_symmetries
-from scripts._shared import write_json
+from scripts._shared import parser_of, read_json, write_json
 from scripts.scenes.families import FAMILIES, random_shape
 from scripts.scenes.materials import random_colour, random_texture
 from scripts.scenes.packages import package
@@ -66,7 +65,7 @@ class Packages:
 
     photographs: Sequence[Path] = ()  # pictures on walls and floors
 
-    def __init__(self, options: argparse.Namespace) -> None:
+    def __init__(self, options: Namespace) -> None:
         self.seed = options.seed
         self.ids = list(range(1, options.models + 1))
         self.written = self.ids  # those with a mesh file
@@ -100,7 +99,7 @@ class Packages:
 class Twins(Packages):
     """Packages, annotated as others of the same shape with another print."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
+    def __init__(self, options: Namespace) -> None:
         super().__init__(options)
         self.written = [k + TWIN for k in self.ids]
 
@@ -156,7 +155,7 @@ class Shapes(Packages):
 class Variants(Shapes):
     """Shapes of several parts, annotated as others of which one part differs."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
+    def __init__(self, options: Namespace) -> None:
         super().__init__(options)
         self.ids = [k for k in self.ids if len(self._parts(k))]
         self.written = [k + TWIN for k in self.ids]
@@ -215,7 +214,7 @@ class Variants(Shapes):
 class Tied(Shapes):
     """Shapes of one colour that are nearly symmetric; all poses but one are wrong."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
+    def __init__(self, options: Namespace) -> None:
         super().__init__(options)
         self.families = ("handed",) if options.cad == "mirrored" else tuple(TIED_FAMILIES)
         self.written = [k + TWIN for k in self.ids] if options.cad == "mirrored" else self.ids
@@ -237,8 +236,8 @@ class Tied(Shapes):
 class Furniture(Packages):
     """The meshes that meshes.py has catalogued."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
-        listing = json.loads((options.meshes / "meshes.json").read_text())
+    def __init__(self, options: Namespace) -> None:
+        listing = read_json(options.meshes / "meshes.json")
         self.folder = options.meshes
         self.turns = np.array(listing["turns"])
         about_z = {k for k, R in enumerate(self.turns) if R[2, 2] > 0.99}
@@ -313,7 +312,7 @@ def model_row(objects: Packages, folder: Path, obj_id: int) -> dict[str, Any]:
 
 
 def compose(
-    objects: Packages, options: argparse.Namespace, index: int, attempt: int
+    objects: Packages, options: Namespace, index: int, attempt: int
 ) -> tuple[Scene, dict[int, Any]]:
     """Scene ``index``, and the mesh that each of its objects is annotated as: obj_id and mesh."""
     rng = np.random.default_rng((options.seed, index, attempt))
@@ -365,12 +364,12 @@ def compose(
     return scene, annotated
 
 
-def make_scene(objects: Packages, options: argparse.Namespace, index: int) -> list[list[float]]:
+def make_scene(objects: Packages, options: Namespace, index: int) -> list[list[float]]:
     """Write scene ``index`` unless it exists; the visible fractions of each photograph's
     objects."""
     folder = options.out / "test" / f"{index:06d}"
     if folder.exists():
-        infos = json.loads((folder / "scene_gt_info.json").read_text())
+        infos = read_json(folder / "scene_gt_info.json")
         return [[entry["visib_fract"] for entry in infos[key]] for key in sorted(infos, key=int)]
     for attempt in range(20):
         scene, annotated = compose(objects, options, index, attempt)
@@ -430,14 +429,12 @@ def _box(mask: Array) -> list[int]:
     return [int(x) for x in (columns[0], rows[0], columns[-1] - columns[0], rows[-1] - rows[0])]
 
 
-def write_targets(options: argparse.Namespace) -> int:
+def write_targets(options: Namespace) -> int:
     """List the instances that are visible enough in BOP's ``test_targets_bop19.json``; their
     number."""
     targets = []
     for folder in sorted(p for p in (options.out / "test").iterdir() if p.name.isdecimal()):
-        truths, infos = (
-            json.loads((folder / f"scene_{name}.json").read_text()) for name in ("gt", "gt_info")
-        )
+        truths, infos = (read_json(folder / f"scene_{name}.json") for name in ("gt", "gt_info"))
         for key in sorted(truths, key=int):
             for truth, info in zip(truths[key], infos[key], strict=True):
                 if (
@@ -457,7 +454,7 @@ def write_targets(options: argparse.Namespace) -> int:
 _state: list[Any] = []
 
 
-def _start(options: argparse.Namespace) -> None:
+def _start(options: Namespace) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     shapes = Variants if options.cad == "variant" else Shapes
@@ -475,10 +472,8 @@ def _model(obj_id: int) -> dict[str, Any]:
     return model_row(objects, options.out / "models", obj_id)
 
 
-def arguments() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def arguments() -> ArgumentParser:
+    parser = parser_of(__doc__)
     parser.add_argument("--kind", choices=KINDS, default="printed")
     parser.add_argument("--count", type=int, default=300, help="scenes")
     parser.add_argument("--seed", type=int, default=29)

@@ -11,7 +11,6 @@ held-out meshes are excluded), licence, and the symmetries of shape and of appea
     sweethome3d-furniture_1.8-1_all.deb]
 """
 
-import argparse
 import hashlib
 import re
 import subprocess
@@ -27,7 +26,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from scripts._shared import write_json
+from scripts._shared import parser_of, write_json
 from scripts.scenes.textured import TexturedMesh
 
 PACKAGE = "sweethome3d-furniture"
@@ -277,9 +276,7 @@ def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, np.ndarray
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--deb", type=Path, help="file of the package (default: apt-get download)")
     parser.add_argument("--jobs", type=int, default=1)

@@ -14,7 +14,6 @@ so every measure is of kinds that the fit has not seen. --write stores the const
 curvireg_torch/calibration/calibration.json and their quality in scripts/results/calibration.json.
 """
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +22,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from curvireg_torch.registration.confidence import RELIABLE
-from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
+from scripts._shared import REPOSITORY, RESULTS, parser_of, read_json, stamp, write_json
 from scripts.calibration.fits import first_probability, fit_logistic, fit_registrations
 from scripts.calibration.measure import Row, rows_of
 from scripts.calibration.sets import KINDS, MODELS, render_sets, sets_of
@@ -43,7 +42,7 @@ def calibrate(
 ) -> tuple[Row, Row]:
     """Constants, those of other ``models`` as they were, and quality of the new ones on held-out
     kinds of objects."""
-    constants: Row = json.loads(CONSTANTS.read_text())
+    constants: Row = read_json(CONSTANTS)
     quality: Row = {}
     for name in models:
         if name in KINDS:
@@ -78,9 +77,7 @@ def covariance_quality(distances: np.ndarray, scale: float) -> Row:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("work", type=Path)
     parser.add_argument("--meshes", type=Path, help="folder of scripts/benchmark/meshes.py")
     parser.add_argument("--count", type=int, default=400, help="photographs of each set")
@@ -104,7 +101,7 @@ def main() -> None:
         options.meshes,
         level=options.level,
     )
-    record = {"date": today(), "commit": commit(), "constants": constants, "held out": quality}
+    record = stamp() | {"constants": constants, "held out": quality}
     print(json.dumps(record, indent=2))
     if options.write:
         write_json(CONSTANTS, constants)

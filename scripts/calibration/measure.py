@@ -27,6 +27,7 @@ from curvireg_torch.inspection.photographs import without_colours
 from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
 from curvireg_torch.registration import Follower, camera, judging
 from curvireg_torch.registration.confidence import are_near
+from scripts._shared import read_json
 from scripts.calibration.sets import ESTIMATED, GREY, MODELS, SETS, UPRIGHT, photographs_of
 
 Row: TypeAlias = dict[str, Any]
@@ -264,7 +265,7 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
             ),
         )
         found = [(s, row) for s in samples for row in method(s)]
-    groups = json.loads((folder / "benchmark.json").read_text())["groups"]
+    groups = read_json(folder / "benchmark.json")["groups"]
     more = {"set": kind, "object": samples[0]["obj_id"], "grey": grey}
     return [
         {"scene": s["scene_id"], "group": f"{kind} {groups[str(s['obj_id'])]}", **more, **row}

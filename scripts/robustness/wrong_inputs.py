@@ -11,7 +11,6 @@ cut, doubled or removed at random. Each runs in a process with limits on time an
 is scripts/results/wrong_inputs.json; exit code 1 if anything failed.
 """
 
-import argparse
 import json
 import re
 import shlex
@@ -31,7 +30,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from scripts._shared import RESULTS, commit, today, write_json
+from scripts._shared import RESULTS, parser_of, stamp, write_json
 
 # processor seconds and memory that a command may take
 SECONDS = 20.0
@@ -228,9 +227,7 @@ DAMAGED = {
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--damaged", type=int, default=200)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=RESULTS / "wrong_inputs.json")
@@ -249,7 +246,7 @@ def main() -> int:
             lines.append(line.replace("--out out", f"--out out{k}"))  # lists do not share a folder
         answers += pool.map(lambda line: answer(line, folder, None), lines)
     failures = [found for found in answers if "failure" in found]
-    record = {"date": today(), "commit": commit(), "cases": len(wrong), "damaged": len(lines)}
+    record = stamp() | {"cases": len(wrong), "damaged": len(lines)}
     record |= {"codes": Counter(str(found["code"]) for found in answers), "failures": failures}
     write_json(options.out, record)
     print(json.dumps(record, indent=2))

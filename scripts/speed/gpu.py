@@ -9,10 +9,10 @@ number is of a second call of the same kind, after a warm-up. The JSON file is w
 each step, so that a run that is stopped leaves what it has measured.
 """
 
-import argparse
 import json
 import statistics
 import time
+from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -81,7 +81,7 @@ def accuracy(results: Any, poses: list[Tensor]) -> dict[str, float]:
     return {f"within_{limit}": sum(e < limit for e in errors) / len(errors) for limit in (5, 15)}
 
 
-def measure(options: argparse.Namespace, record: Callable[[str, Any], None]) -> None:
+def measure(options: Namespace, record: Callable[[str, Any], None]) -> None:
     device = options.device
     views = cr.sample_views(azimuth_step=60, elevations=[0, 30]) if options.few_views else None
     count = options.photographs
@@ -150,9 +150,7 @@ def measure(options: argparse.Namespace, record: Callable[[str, Any], None]) -> 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _shared.parser_of(__doc__)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--photographs", type=int, default=64)
     parser.add_argument("--few-views", action="store_true", help="to try the script itself")
@@ -161,8 +159,7 @@ def main() -> None:
     on_cpu = options.device == "cpu"
     start = time.perf_counter()
     measured: dict[str, Any] = {
-        "date": _shared.today(),
-        "commit": _shared.commit(),
+        **_shared.stamp(),
         "processor": _shared.processor() if on_cpu else torch.cuda.get_device_name(options.device),
         "torch": torch.__version__,
     }

@@ -26,7 +26,6 @@ not be kept for the second. An earlier command has registered ten others of the 
   batch
 """
 
-import argparse
 import json
 import os
 import shutil
@@ -134,7 +133,7 @@ def measure(step: str, folder: str, photographs: int, device: str) -> dict[str, 
         cr.ViewBank.build(mesh, progress=False, device=device)
         return watch.seconds(1)
     paths = [str(Path(folder, f"photo{k}.png")) for k in range(EARLIER + photographs)]
-    boxes = torch.tensor(json.loads(Path(folder, "boxes.json").read_text()))
+    boxes = torch.tensor(_shared.read_json(Path(folder, "boxes.json")))
     pipeline = replace(cr.Pipeline(), contours=step != "rank")
     registrar = cr.Registrar(mesh, pipeline=pipeline, device=device, progress=False)
     if step == "follow":
@@ -207,7 +206,7 @@ def measured(
         return {**json.loads(output.splitlines()[-1]), "megabytes": usage.ru_maxrss / 1024}
     # another checkout refuses to replace files that it did not write
     shutil.rmtree(folder / "out", ignore_errors=True)
-    boxes = json.loads((folder / "boxes.json").read_text())
+    boxes = _shared.read_json(folder / "boxes.json")
     words = ["-m", "curvireg_torch", "register", f"photo{EARLIER}.png", "mesh.ply", "--out", "out"]
     words += ["--box", *map(str, boxes[EARLIER]), "--camera", *map(str, CAMERA)]
     seconds, usage, _ = _shared.run_process(words, folder, environment)
@@ -278,9 +277,7 @@ def cell(measurement: dict[str, float]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     import torch
 
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _shared.parser_of(__doc__)
     parser.add_argument(
         "--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository"
     )

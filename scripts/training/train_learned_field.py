@@ -7,7 +7,6 @@ A batch consists of fresh scenes and of earlier ones, with new colours and mirro
 those of field_dataset.py; one of them is backpropagated through HOG.
 """
 
-import argparse
 import json
 import math
 import time
@@ -25,6 +24,7 @@ from curvireg_torch.features.learned_field import save_weights
 from curvireg_torch.geometry import rotation_error, sample_views
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.describe import depth_filter, hog_layer
+from scripts._shared import parser_of
 from scripts.training.field_dataset import SETTINGS, FieldDataset, ReplayBuffer, augment, losses
 from scripts.training.generated import GeneratedScenes
 
@@ -85,9 +85,7 @@ class _Field(torch.nn.Module):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of weights and log")
     parser.add_argument("--minutes", type=float, default=90.0, help="training time")
     parser.add_argument("--batch", type=int, default=32, help="scenes in a step")
