@@ -27,8 +27,42 @@ class Surface(NamedTuple):
         return Surface(points + np.asarray(translation, dtype=float), self.faces)
 
 
-Part: TypeAlias = tuple[Surface, int]
-"""A surface and its material number; parts with the same number have the same material."""
+class Parts:
+    """Surfaces with material numbers; parts with the same number have the same material."""
+
+    def __init__(self) -> None:
+        self.surfaces: list[Surface] = []
+        self.materials: list[Array] = []
+
+    def add(
+        self,
+        surface: Surface,
+        material: int,
+        at: ArrayLike | None = None,
+        rotation: Array | None = None,
+    ) -> None:
+        """Add a surface, rotated and moved by ``at``."""
+        self.surfaces.append(surface if at is None else surface.moved(at, rotation))
+        self.materials.append(np.full(len(surface.faces), material))
+
+    def joined(self) -> tuple[Surface, Array]:
+        """One surface, and the material numbers (F,) of its faces."""
+        return join(self.surfaces), np.concatenate(self.materials)
+
+
+def rotation(axis: int, angle: float) -> Array:
+    """(3, 3) rotation by ``angle`` radians about coordinate axis 0, 1 or 2."""
+    c = np.cos(angle)
+    s = np.sin(angle)
+    i, j = [(1, 2), (2, 0), (0, 1)][axis]
+    R = np.eye(3)
+    R[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
+    return R
+
+
+def unit_circle(angles: Array) -> Array:
+    """(N, 2) points at angles (N,) in radians."""
+    return np.stack([np.cos(angles), np.sin(angles)], -1)
 
 
 def _grid(points: Array, *, close: bool = True, caps: bool = True) -> Surface:
@@ -53,8 +87,7 @@ def _grid(points: Array, *, close: bool = True, caps: bool = True) -> Surface:
 
 
 def _circle(n: int = AROUND) -> Array:
-    t = 2 * np.pi * np.arange(n) / n
-    return np.stack([np.cos(t), np.sin(t)], -1)
+    return unit_circle(2 * np.pi * np.arange(n) / n)
 
 
 def loft(outlines: Array, heights: ArrayLike) -> Surface:
@@ -88,11 +121,16 @@ def lathe(radii: ArrayLike, heights: ArrayLike) -> Surface:
     return loft(np.asarray(radii, dtype=float)[:, None, None] * _circle(), heights)
 
 
+def disc(radius: float, low: float, high: float) -> Surface:
+    """Cylinder about z between two heights."""
+    return lathe(np.full(2, radius), np.array([low, high]))
+
+
 def superquadric(size: ArrayLike, roundness: tuple[float, float]) -> Surface:
     """Superquadric with half axes ``size``: exponents 1 make an ellipsoid, towards 0 a box."""
     v = np.linspace(-0.5, 0.5, AROUND // 2 + 1) * np.pi
     ring = _power(_circle(), roundness[1])
-    level = _power(np.stack([np.cos(v), np.sin(v)], -1), roundness[0])
+    level = _power(unit_circle(v), roundness[0])
     points = np.concatenate(
         [level[:, :1, None] * ring, np.broadcast_to(level[:, 1:, None], (len(v), AROUND, 1))], -1
     )
@@ -124,8 +162,7 @@ def bar(start: ArrayLike, end: ArrayLike, radius: float, *, sides: int = 10) -> 
     side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
     side /= np.linalg.norm(side)
     frame = np.stack([side, np.cross(axis, side)])
-    t = 2 * np.pi * (np.arange(sides) + 0.5) / sides
-    ring = radius * np.stack([np.cos(t), np.sin(t)], -1) @ frame
+    ring = radius * unit_circle(2 * np.pi * (np.arange(sides) + 0.5) / sides) @ frame
     return _grid(np.stack([a + ring, b + ring]))
 
 

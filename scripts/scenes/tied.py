@@ -5,11 +5,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from scripts.scenes.families import rotation
-from scripts.scenes.surfaces import AROUND, Array, Part, Rng, Surface, bar, box, join, lathe
+from scripts.scenes.surfaces import (
+    AROUND,
+    Array,
+    Rng,
+    Surface,
+    bar,
+    box,
+    disc,
+    join,
+    lathe,
+    rotation,
+)
 
 
-def holed(rng: Rng) -> list[Part]:
+def holed(rng: Rng) -> Surface:
     """A body of revolution with one hole in its wall."""
     levels = int(rng.integers(4, 9))
     radii = rng.uniform(0.3, 0.45) * np.ones(levels)
@@ -23,47 +33,46 @@ def holed(rng: Rng) -> list[Part]:
     ring = np.arange((levels - 1) * AROUND)
     hidden = (ring // AROUND == row) & ((ring % AROUND - first) % AROUND < columns)
     kept = np.concatenate([np.tile(~hidden, 2), np.ones(len(body.faces) - 2 * len(ring), bool)])
-    return [(Surface(body.vertices, body.faces[kept]), 0)]
+    return Surface(body.vertices, body.faces[kept])
 
 
-def hollow(rng: Rng) -> list[Part]:
+def hollow(rng: Rng) -> Surface:
     """A box with a cavity in one half, open below."""
     w, d, h = rng.uniform((0.8, 0.4, 0.3), (1.4, 0.8, 0.7))
     wall = rng.uniform(0.03, 0.08)
     deep = h - wall
     cavity = (0.5 * w - 1.5 * wall, d - 2.0 * wall, deep)
     at = 0.25 * w
-    parts = [
-        _without_bottom((w, d, h), (0.0, 0.0, 0.5 * h)),
-        _without_bottom(cavity, (at, 0.0, 0.5 * deep)),
-    ]
-    half = np.array(
-        [(-0.5 * w, -0.5 * d, 0), (0.0, -0.5 * d, 0), (0.0, 0.5 * d, 0), (-0.5 * w, 0.5 * d, 0)]
+    x = -0.5 * w
+    y = 0.5 * d
+    half = Surface(
+        np.array([(x, -y, 0), (0.0, -y, 0), (0.0, y, 0), (x, y, 0)]),
+        np.array([[0, 2, 1], [0, 3, 2]]),
     )
-    parts.append(Surface(half, np.array([[0, 2, 1], [0, 3, 2]])))
-    return [(part, 0) for part in parts]
+    whole = _without_bottom((w, d, h), (0.0, 0.0, 0.5 * h))
+    return join([whole, _without_bottom(cavity, (at, 0.0, 0.5 * deep)), half])
 
 
-def footed(rng: Rng) -> list[Part]:
+def footed(rng: Rng) -> Surface:
     """A box or a disc with a block under one end."""
     w, d, h = rng.uniform((0.7, 0.5, 0.15), (1.2, 0.7, 0.6))
     round_body = rng.random() < 0.4
     body = _body(w, d, h, 0.5 * w if round_body else None)
     block = box(rng.uniform((0.1, 0.1, 0.03), (0.2, 0.25, 0.08)))
-    return [(body, 0), (block.moved((0.3 * w, 0, -0.02)), 0)]
+    return join([body, block.moved((0.3 * w, 0, -0.02))])
 
 
-def marked(rng: Rng) -> list[Part]:
+def marked(rng: Rng) -> Surface:
     """A box or a cylinder with a small cube on one end of its top."""
     w, d, h = rng.uniform((0.8, 0.4, 0.3), (1.2, 0.7, 0.7))
     round_body = rng.random() < 0.3
     body = _body(w, d, h, 0.4 * w if round_body else None)
     side = rng.uniform(0.05, 0.14)
     at = 0.4 * w - 0.5 * side if not round_body else 0.3 * w
-    return [(body, 0), (box(side).moved((at, 0, h + 0.5 * side)), 0)]
+    return join([body, box(side).moved((at, 0, h + 0.5 * side))])
 
 
-def plated(rng: Rng) -> list[Part]:
+def plated(rng: Rng) -> Surface:
     """A plate or a disc with a flat block, 0.03 to 0.05 radii high, on one end of its top."""
     w, d, h = rng.uniform((0.9, 0.6, 0.08), (1.2, 0.9, 0.3))
     round_body = rng.random() < 0.3
@@ -71,11 +80,11 @@ def plated(rng: Rng) -> list[Part]:
     radius = 0.5 * float(np.linalg.norm((w, w if round_body else d, h)))
     long, wide = rng.uniform(0.12, 0.3, 2)
     high = rng.uniform(0.03, 0.05) * radius
-    block = box((long, wide, high))
-    return [(body, 0), (block.moved((0.45 * w - 0.5 * long, 0, h + 0.5 * high)), 0)]
+    block = box((long, wide, high)).moved((0.45 * w - 0.5 * long, 0, h + 0.5 * high))
+    return join([body, block])
 
 
-def handed(rng: Rng) -> list[Part]:
+def handed(rng: Rng) -> Surface:
     """A bracket that its mirror image does not match, such as a left part."""
     long, wide, thick = rng.uniform((0.8, 0.3, 0.08), (1.2, 0.5, 0.2))
     plate = box((long, wide, thick))
@@ -83,13 +92,13 @@ def handed(rng: Rng) -> list[Part]:
     arm = arm.moved((0.5 * (long - thick), 0, 0.5 * float(np.ptp(arm.vertices[:, 2]))))
     reach = rng.uniform(0.3, 0.6)
     pin = bar((-0.3 * long, 0, 0), (-0.3 * long, 0.5 * wide + reach, 0), rng.uniform(0.04, 0.09))
-    return [(plate, 0), (arm, 0), (pin, 0)]
+    return join([plate, arm, pin])
 
 
 def _body(width: float, depth: float, height: float, radius: float | None) -> Surface:
     """A cylinder if there is a radius, else a box; it stands on z = 0."""
     if radius is not None:
-        return lathe(np.full(2, radius), np.array([0.0, height]))
+        return disc(radius, 0.0, height)
     return box((width, depth, height)).moved((0, 0, 0.5 * height))
 
 
@@ -100,7 +109,7 @@ def _without_bottom(size: tuple[float, float, float], at: tuple[float, float, fl
     return Surface(solid.vertices, solid.faces[~bottom])
 
 
-FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
+FAMILIES: dict[str, Callable[[Rng], Surface]] = {
     family.__name__: family for family in (holed, hollow, footed, marked, handed, plated)
 }
 
@@ -108,7 +117,7 @@ FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
 def tied_shape(rng: Rng, family: str) -> tuple[Array, Array]:
     """Vertices (V, 3) of radius 1 around the origin, z up, and faces (F, 3), of a family of
     ``FAMILIES``."""
-    surface = join([part for part, _ in FAMILIES[family](rng)])
+    surface = FAMILIES[family](rng)
     points = surface.vertices @ rotation(2, rng.uniform(0.0, 2.0 * np.pi)).T
     points = points - 0.5 * (points.min(axis=0) + points.max(axis=0))
     return points / float(np.linalg.norm(points, axis=1).max()), surface.faces
