@@ -561,7 +561,7 @@ def _angles(pose: Mapping[str, Any]) -> str:
 def _print_rivals(document: Mapping[str, Any]) -> None:
     """Print rivals that are nearly as probable as the best pose, if there are any."""
     from ..registration.confidence import two_decimals
-    from ..registration.result import RIVAL_FRACTION
+    from ..registration.result import likely_rivals
 
     if document["ambiguous"] is None:
         return
@@ -570,15 +570,14 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
         of_meshes = ", ".join(f"mesh {k}: {two_decimals(p)}" for k, p in every)
         print(f"several meshes fit: {of_meshes}; a photograph of where they differ decides")
         return
-    poses = zip(document["hypotheses"], document["probabilities"], strict=False)
-    rivals = list(poses)[1:]
-    least = RIVAL_FRACTION * document["confidence"]
-    likely = [(rival, probability) for rival, probability in rivals if probability >= least]
+    probabilities = document["probabilities"]
+    likely = likely_rivals(probabilities, document["pair_probability"])
     if not likely:
         print("right up to turns that only a small feature tells apart, which is not in view")
         return
-    for rival, probability in likely:
-        print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
+    for k in likely:
+        rival = _angles(document["hypotheses"][k])
+        print(f"could also be: {rival}   probability {two_decimals(probabilities[k])}")
     words = {
         "half turn": "are flipped by 180 degrees",
         "mirror": "are mirror images",

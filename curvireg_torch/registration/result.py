@@ -2,7 +2,7 @@
 
 import html
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Generic, Self, TypeVar, overload
 
@@ -323,18 +323,14 @@ class Registration:
 
     @property
     def ambiguous(self) -> str | None:
-        """How poses differ that are nearly as probable as the first: "half turn", "mirror" or
+        """How the first pose and its :func:`likely_rivals` differ: "half turn", "mirror" or
         "several", as are those that only a hidden feature of the mesh tells apart; "mesh 0 or 1" of
-        meshes that are; else None."""
+        meshes that are nearly as probable; else None."""
         if likely_meshes := self._likely_meshes:
             return f"mesh {' or '.join(str(k) for k in likely_meshes)}"
-        likely = [p >= RIVAL_FRACTION * self.probabilities[0] for p in self.probabilities]
-        near = [
-            h.allocentric_rotation
-            for h, is_near in zip(self.hypotheses, likely, strict=False)
-            if is_near
-        ]
-        named = ambiguity(torch.stack(near)) if near else None
+        likely = [0, *likely_rivals(self.probabilities, self.pair_probability)]
+        poses = [self.hypotheses[k].allocentric_rotation for k in likely]
+        named = ambiguity(torch.stack(poses))
         return "several" if named is None and self.feature_is_hidden else named
 
     @property
@@ -558,6 +554,18 @@ class FailedRegistration:
         if name.startswith("_") or name not in of_pose:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         raise self.error
+
+
+def likely_rivals(probabilities: Sequence[float], pair_probability: float | None) -> list[int]:
+    """Numbers of the hypotheses that are nearly as probable as the first; the second is, too, where
+    the pair of both is reliable and the first alone is not."""
+    if not probabilities:
+        return []
+    first = probabilities[0]
+    likely = [p >= RIVAL_FRACTION * first for p in probabilities]
+    if len(likely) > 1 and first < RELIABLE <= (pair_probability or 0.0):
+        likely[1] = True
+    return [k for k, is_likely in enumerate(likely) if is_likely and k > 0]
 
 
 def ambiguity(rotations: Tensor) -> str | None:

@@ -412,11 +412,14 @@ def test_rivals_and_hidden_features_are_named(capsys):
         "no_match_probability": 0.1,
         "hypotheses": [{"viewpoint": viewpoint}] * 3,
         "probabilities": [0.45, 0.44, 0.01],
+        "pair_probability": None,
     }
-    _print_rivals(tied)
-    printed = capsys.readouterr().out
-    assert printed.count("could also be") == 1
-    assert "flipped by 180 degrees" in printed
+    of_pair = {"confidence": 0.63, "probabilities": [0.63, 0.31, 0.01], "pair_probability": 0.94}
+    for document in (tied, tied | of_pair):
+        _print_rivals(document)
+        printed = capsys.readouterr().out
+        assert printed.count("could also be") == 1
+        assert "flipped by 180 degrees" in printed
     certain = {"confidence": 0.95, "probabilities": [0.95, 0.01, 0.01]}
     _print_rivals(tied | certain | {"ambiguous": "several"})
     printed = capsys.readouterr().out

@@ -10,7 +10,7 @@ import torch
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.registration import FailedRegistration
-from curvireg_torch.registration.result import Axis, ambiguity
+from curvireg_torch.registration.result import Axis, ambiguity, likely_rivals
 from tests._support.results import registration
 
 
@@ -89,6 +89,32 @@ def test_ambiguity():
             word,
             pytest.approx(0.4 - second),
         )
+
+
+@pytest.mark.parametrize(
+    ("probabilities", "pair", "rivals"),
+    [
+        ((), None, []),
+        ((0.6,), 0.95, []),
+        ((0.6, 0.3, 0.2), None, [1]),
+        ((0.6, 0.29, 0.31), None, [2]),
+        ((0.6, 0.29, 0.05), 0.9, [1]),
+        ((0.6, 0.29, 0.05), 0.89, []),
+        ((0.89, 0.05), 0.94, [1]),
+        ((0.9, 0.05), 0.95, []),
+    ],
+)
+def test_rivals_are_half_as_probable_or_the_second_of_a_reliable_pair(probabilities, pair, rivals):
+    assert likely_rivals(probabilities, pair) == rivals
+
+
+def test_a_reliable_pair_of_which_none_is_reliable_is_ambiguous():
+    found = registration()
+    pairs = zip(found.hypotheses, turned(0.0, 180.0), strict=True)
+    hypotheses = tuple(replace(h, allocentric_rotation=R) for h, R in pairs)
+    result = replace(found, hypotheses=hypotheses, probabilities=(0.6, 0.29))
+    assert result.ambiguous is None
+    assert replace(result, pair_probability=0.9).ambiguous == "half turn"
 
 
 def test_of_several_meshes_none_is_right_where_all_of_them_are_improbable():
