@@ -188,7 +188,10 @@ def _expectation(report: Inspection) -> str:
     for ranges, name in ((by_elevation, "elevation {}°"), (by_pixels, "{} px across")):
         rows += [_row(name.format(interval), expected) for interval, expected in ranges.items()]
     for name, (before, after) in report.trial.compared.items():
-        rows += [_row(f"the first {before.n} of them", before), _row(name, after)]
+        compared_with = _row(f"the first {before.n} of all", before)
+        if compared_with not in rows:
+            rows.append(compared_with)
+        rows.append(_row(name, after))
     surroundings = "other objects around it" if report.clutter else "no clutter, nothing in front"
     note = (
         f"Right: within 30 degrees. Generated photographs ({surroundings}) are simpler than real "

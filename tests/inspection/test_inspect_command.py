@@ -51,6 +51,7 @@ def test_report_and_page(tmp_path, capsys, inspect):
     assert all(pair["n"] == 1 for both in expected["compared"].values() for pair in both.values())
     page = (out / "inspect.html").read_text()
     assert page.count("data:image/jpeg") >= 4, "two pairs of views"
+    assert page.count("<td>the first 1 of all</td>") == 1, "what four are compared with is one row"
     assert "other objects around it" in page
     printed, shown = capsys.readouterr()
     assert "expected: right in" in printed
