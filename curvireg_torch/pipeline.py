@@ -22,6 +22,7 @@ from .geometry import ViewSphere, paper_views, sample_views, uniform_views
 from .geometry.viewpoint import DEFAULT_DISTANCE
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, Term, check_box_jitter
 from .utils.checks import check_integer, check_option, check_positive, check_probability
+from .utils.choices import BOX_KINDS
 from .utils.choices import DEFAULT as DEFAULT
 from .utils.files import tensor_digest
 
@@ -270,6 +271,8 @@ class Pipeline:
         terms: ranking terms, each at most once.
         box_jitter: error that boxes are allowed, as a fraction of their longer side in [0, 0.45];
             0: exact boxes.
+        box_is: "whole": boxes are those of the whole object. "visible": those of its visible part,
+            and an occluder may hide the rest.
         hypotheses: distinct views that are carried through search and contour fit.
         search: the paper's search between the coherent ones of the three best views, without
             contour fit.
@@ -295,6 +298,7 @@ class Pipeline:
         default=(Correlation(), Repeatability(), BoxShape(), Appearance())
     )
     box_jitter: float = 0.1
+    box_is: str = "whole"
     hypotheses: int = 5
     search: bool = False
     contours: bool = True
@@ -323,10 +327,15 @@ class Pipeline:
                 "search: the paper's search takes the place of the contour fit; set contours=False"
             )
         check_box_jitter(self.box_jitter)
+        check_option(self.box_is, BOX_KINDS, "box_is")
 
     def with_pose_prior(self, pose: str) -> "Pipeline":
         """A copy with another ``pose`` of the view policy."""
         return replace(self, views=replace(self.views, pose=pose))
+
+    def with_boxes(self, box_is: str) -> "Pipeline":
+        """A copy for boxes of another kind, see ``box_is``."""
+        return replace(self, box_is=box_is)
 
     def with_term(self, name: str, **options: Any) -> "Pipeline":
         """A copy with other options of one term; ``weight=0`` removes the term from the product."""

@@ -78,6 +78,7 @@ def test_json_contains_every_setting():
         {"field": "focus", "weights": ""},
         {"terms": base.terms[:2]},
         {"box_jitter": 0.2},
+        {"box_is": "visible"},
         {"weights": "0123"},
     ]
     settings += [{"hypotheses": 6}, {"search": True, "contours": False}, {"contours": False}]
@@ -131,6 +132,7 @@ def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_
         ('{"terms": {"hug": {}}}', "term: expected one of 'hog'"),
         *((f'{{"terms": {{"{name}": {{"weight": -1}}}}}}', f"{name}: weight") for name in TERMS),
         ('{"box_jitter": 0.6}', "box_jitter"),
+        ('{"box_is": "half"}', "box_is: expected one of 'whole', 'visible'"),
         ('{"terms": {"appearance": {}}}', "each term once, and 'hog'"),
         ('{"box_jitter": "0.1"}', "box_jitter"),
         ('{"hypotheses": 2.5}', "hypotheses"),

@@ -26,7 +26,7 @@ DECLARED: dict[str, dict[str, Any]] = FIELDS | PRIOR_OPTIONS
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
 MESH = ("unit", "link", "textures", "pose", "up")
 BOXES = ("box_format", "boxes")
-PHOTOGRAPH = ("box", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
+PHOTOGRAPH = ("box", "box_is", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
 """Options of several commands, by the names of their fields."""
 
 

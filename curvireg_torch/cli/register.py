@@ -458,6 +458,7 @@ def _register_several(
     names = (
         "bank_decides",
         "pose",
+        "box_is",
         "mesh_is",
         "unit",
         "link",

@@ -112,8 +112,10 @@ class Benchmark(ABC):
         label = self.label.format_map(sample)
         meshes = self.meshes(sample)
         photo = Path(sample["image_path"])
-        box = sample["box"]
         protocol = self.protocol
+        unknown = torch.full_like(sample["box"], torch.nan)
+        visible = sample.get("box_visible", unknown)
+        box = visible if protocol.box_is == "visible" else sample["box"]
         error = "" if meshes else "no_other_cad"
         if protocol.box is not None and not bool(box.isfinite().all()):
             error = "unknown_box"

@@ -78,6 +78,7 @@ def evaluate(
     name = next((known for known, settings in PRESETS.items() if settings is pipeline), "custom")
     if pipeline.views.pose != "paper":  # the paper's grid stays, whatever is known
         pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
+    pipeline = pipeline.with_boxes(benchmark.protocol.box_is)
     if limit is not None:
         check_positive(limit, "limit")
     if (out / "results.csv").exists():

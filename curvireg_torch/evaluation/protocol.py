@@ -12,6 +12,7 @@ from ..errors import InvalidInputError
 from ..geometry import rotation_from_axis_angle, viewpoint_from_rotation
 from ..geometry.pose_prior import PosePrior
 from ..utils.checks import check_integer, check_option
+from ..utils.choices import BOX_KINDS
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class Protocol:
         pose: pose prior: "upright" or "any".
         box: 0: as annotated; x > 0 moves each edge at random by up to x of the side; None: the
             object is detected.
+        box_is: "whole": boxes are those of whole objects. "visible": those of their visible parts,
+            and the method is told so; for datasets that have them.
         hint: "azimuth:45": the azimuth lies within 45 degrees of a value that is itself up to 45
             degrees off; "pose:45": the same of the whole rotation; "none".
         views: photographs of one pose that are registered together, each once as the first; for
@@ -45,6 +48,7 @@ class Protocol:
     cad: str = "annotated"
     pose: str = "upright"
     box: float | None = 0.0
+    box_is: str = "whole"
     hint: str = "none"
     views: int = 1
     seed: int = 0
@@ -52,6 +56,7 @@ class Protocol:
     def __post_init__(self) -> None:
         check_option(self.cad, ("annotated", "any", "other"), "cad")
         check_option(self.pose, ("upright", "any"), "pose")
+        check_option(self.box_is, BOX_KINDS, "box_is")
         if self.box is not None and not 0.0 <= self.box <= 0.45:
             raise InvalidInputError(f"box: expected a fraction in [0, 0.45], got {self.box}")
         if self.hint != "none":
@@ -102,7 +107,8 @@ class Protocol:
         views = "" if self.views == 1 else f" views={self.views}"
         draws = self.box or hint or views or self.cad == "other"
         seed = f" seed={self.seed}" if draws else ""
-        return f"cad={self.cad} pose={self.pose} box={box}{hint}{views}{seed}"
+        kind = "" if self.box_is == "whole" else f" box_is={self.box_is}"
+        return f"cad={self.cad} pose={self.pose} box={box}{kind}{hint}{views}{seed}"
 
 
 def perturbed_box(box: Tensor, protocol: Protocol, label: str) -> Tensor:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..filters.operations import central_gradient, fill_missing, smooth
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
+from ..geometry.framing import photograph_box
 from ..rendering.contours import ContourPoints
 from ..terms import crop_photographs
 from ..utils.checks import check_pixels
@@ -30,8 +31,8 @@ imitate."""
 class EdgeField:
     """Edges of image crops (B, C, S, S) in [0, 1]; the strongest of several channels counts.
 
-    ``inside`` (B, 1, S, S), if given, is 0 outside the photograph: there are no edges, though crops
-    repeat its border.
+    ``inside`` (B, 1, S, S), if given, is 0 where edges do not count, such as outside the
+    photograph, though crops repeat its border.
     """
 
     def __init__(self, crops: Tensor, inside: Tensor | None = None) -> None:
@@ -171,7 +172,7 @@ class EdgeCrops:
 
     Args:
         crops: (B, C, S, S) in [0, 1], without missing pixels.
-        inside: (B, 1, S, S), 1 where they show the photograph, see :func:`inside_photographs`.
+        inside: (B, 1, S, S), 1 where edges count, see :func:`inside_boxes`.
         transforms: (B, 3, 3) from pixels of the photographs to those of the crops.
         mask: (B, 1, s, s) probability that pixels of the crops belong to the object.
     """
@@ -188,16 +189,26 @@ class EdgeCrops:
 
     @classmethod
     def cut(
-        cls, images: Sequence[Tensor], boxes: Tensor, margin: float, mask: Tensor | None = None
+        cls,
+        images: Sequence[Tensor],
+        boxes: Tensor,
+        margin: float,
+        mask: Tensor | None = None,
+        *,
+        shown: Tensor | None = None,
     ) -> "EdgeCrops":
         """Cut the boxes (B, 4) with their ``margin`` out of photographs; grey ones get three equal
-        channels, as :func:`.read_photo` gives them: the level of edges is a sum over channels."""
+        channels, as :func:`.read_photo` gives them: the level of edges is a sum over channels.
+        Edges count within the boxes ``shown`` (B, 4), by default in the whole photographs."""
         cut = crop_photographs(images, boxes, size=CROP_SIZE, margin=margin).float()
         crops = fill_missing(cut.expand(-1, 3, -1, -1))
         check_pixels(crops, "of the box")
         transforms = crop_transforms(square_boxes(boxes, margin), CROP_SIZE)
         mask = None if mask is None else mask.cpu()
-        return cls(crops, inside_photographs(images, boxes, CROP_SIZE, margin), transforms, mask)
+        if shown is None:
+            sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
+            shown = torch.stack([photograph_box(size) for size in sizes])
+        return cls(crops, inside_boxes(shown, boxes, CROP_SIZE, margin), transforms, mask)
 
     @classmethod
     def cat(cls, parts: Sequence["EdgeCrops"]) -> "EdgeCrops":
@@ -233,16 +244,13 @@ class EdgeCrops:
         return self._fields[factor]
 
 
-def inside_photographs(images: Sequence[Tensor], boxes: Tensor, size: int, margin: float) -> Tensor:
-    """(B, 1, size, size) float32: 1 where crops around (B, 4) boxes show their photograph, 0 where
-    they repeat its border."""
+def inside_boxes(shown: Tensor, boxes: Tensor, size: int, margin: float) -> Tensor:
+    """(B, 1, size, size) float32: 1 where crops around (B, 4) boxes lie in the boxes ``shown`` (B,
+    4), such as those of their photographs, whose border crops repeat."""
     A = image_transforms(square_boxes(boxes, margin), size)
     at = torch.arange(size, dtype=A.dtype)
     x, y = (A[:, k, k, None] * at + A[:, k, 2, None] for k in (0, 1))
-    ends = (
-        torch.tensor([[image.shape[-1], image.shape[-2]] for image in images], dtype=A.dtype) - 0.5
-    )
-    across, down = (
-        (p >= -0.5) & (p <= end[:, None]) for p, end in zip((x, y), ends.unbind(-1), strict=True)
-    )
+    x0, y0, x1, y1 = shown.to(A).unsqueeze(-1).unbind(1)
+    across = (x >= x0) & (x <= x1)
+    down = (y >= y0) & (y <= y1)
     return (down[:, None, :, None] & across[:, None, None, :]).float()

@@ -13,9 +13,13 @@ from .crops import crop_transforms, image_transforms, square_boxes
 BORDER = 1.5  # Pixels from the border within which a side of a box lies on it
 # By how much an object may go on beyond the border, as fractions of what is visible of it
 EXTENSIONS = (0.4, 1.2)
+# By how much it may go on behind an occluder, on one side
+HIDDEN_EXTENSIONS = (0.35, 1.0)
+# Error that the box of a visible part is allowed, as a fraction of its longer side
+VISIBLE_MARGIN = 0.05
 
 
-def _photograph_box(size: tuple[int, int]) -> Tensor:
+def photograph_box(size: tuple[int, int]) -> Tensor:
     """(4,) float64 box of a photograph of ``size`` (H, W)."""
     height, width = size
     return torch.tensor([-0.5, -0.5, width - 0.5, height - 0.5], dtype=torch.float64)
@@ -23,7 +27,7 @@ def _photograph_box(size: tuple[int, int]) -> Tensor:
 
 def clipped(box: Tensor, size: tuple[int, int]) -> Tensor:
     """The part of a box (4,) inside a photograph of ``size`` (H, W), which it overlaps."""
-    limits = _photograph_box(size).to(box)
+    limits = photograph_box(size).to(box)
     low = torch.maximum(box[:2], limits[:2])
     high = torch.minimum(box[2:], limits[2:])
     return torch.cat([low, high])
@@ -44,7 +48,7 @@ def border_sides(box: Tensor, size: tuple[int, int]) -> int:
 def _on_border(box: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Which of the sides x0, y0 and of the sides x1, y1 of a box (4,) lie on the border of a
     photograph of ``size`` (H, W), or beyond it, each (2,) bool."""
-    limits = _photograph_box(size).to(box)
+    limits = photograph_box(size).to(box)
     return box[:2] <= limits[:2] + BORDER, box[2:] >= limits[2:] - BORDER
 
 
@@ -70,29 +74,50 @@ def whole_boxes(box: Tensor, size: tuple[int, int]) -> list[Tensor]:
     ]
 
 
+def hidden_boxes(box: Tensor) -> list[Tensor]:
+    """Boxes that the whole object may have whose visible part has a ``box`` (4,): behind an
+    occluder it goes on beyond one of the four sides, by ``HIDDEN_EXTENSIONS`` of the box's width or
+    height.
+
+    Example:
+        >>> box = torch.tensor([0.0, 0.0, 40.0, 20.0])
+        >>> [whole.tolist() for whole in hidden_boxes(box)][::3]
+        [[-14.0, 0.0, 40.0, 20.0], [0.0, 0.0, 40.0, 27.0], [0.0, 0.0, 80.0, 20.0]]
+    """
+    sides = (box[2:] - box[:2]).repeat(2) * box.new_tensor([-1.0, -1.0, 1.0, 1.0])
+    return [box + extension * side for extension in HIDDEN_EXTENSIONS for side in sides.diag()]
+
+
+def around_visible(box: Tensor, size: tuple[int, int]) -> Tensor:
+    """(4,) the part of a photograph of ``size`` (H, W) that shows an object whose visible part has
+    a ``box`` (4,)."""
+    margin = VISIBLE_MARGIN * (box[2:] - box[:2]).max()
+    return clipped(torch.cat([box[:2] - margin, box[2:] + margin]), size)
+
+
 @dataclass(frozen=True)
 class CropFrame:
     """What the crop of a box shows. In it, poses are compared as the photograph's camera sees them,
-    without what the border cuts off.
+    without what the border, or an occluder beside the box, cuts off.
 
     Attributes:
         transform: (3, 3) from px of the photograph to those of the crop.
-        inside: (1, S, S) bool, pixels of the crop that lie in the photograph.
+        inside: (1, S, S) bool, pixels of the crop that count.
     """
 
     transform: Tensor
     inside: Tensor
 
     @classmethod
-    def of(cls, box: Tensor, size: tuple[int, int], *, side: int, margin: float) -> "CropFrame":
-        """The frame of the crop of a box (4,), with a ``margin`` around it, to ``side`` px, in a
-        photograph of ``size`` (H, W)."""
+    def of(cls, box: Tensor, shown: Tensor, *, side: int, margin: float) -> "CropFrame":
+        """The frame of the crop of a box (4,), with a ``margin`` around it, to ``side`` px, of
+        which what lies in the box ``shown`` (4,) counts."""
         square = square_boxes(box.double(), margin)
         to_photograph = image_transforms(square, side)
         pixels = torch.arange(side, dtype=torch.float64)
         x = to_photograph[0, 0] * pixels + to_photograph[0, 2]
         y = to_photograph[1, 1] * pixels + to_photograph[1, 2]
-        x0, y0, x1, y1 = _photograph_box(size)
+        x0, y0, x1, y1 = shown.double()
         inside = ((y >= y0) & (y <= y1))[:, None] & ((x >= x0) & (x <= x1))
         return cls(crop_transforms(square, side), inside[None])
 
@@ -117,7 +142,7 @@ def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) 
     if float(depth.min()) <= 0.0:
         return 1.0
     pixels = project_points(hull.to(T), T[None], K[None])[0].numpy()
-    x0, y0, x1, y1 = _photograph_box(size).tolist()
+    x0, y0, x1, y1 = photograph_box(size).tolist()
     # In units of the photograph's longer side: OpenCV computes in single precision.
     scale = 1.0 / max(size)
     outline = cv2.convexHull((scale * pixels).astype(np.float32))

@@ -34,6 +34,8 @@ def open_registrar(
             pipeline = replace(pipeline, views=banks[0].pipeline.views)
     if not options.refine:
         pipeline = replace(pipeline, contours=False, search=False)
+    if options.box_is is not None:
+        pipeline = pipeline.with_boxes(options.box_is)
     if options.hypotheses is not None:
         pipeline = replace(pipeline, hypotheses=options.hypotheses)
     settings: dict[str, Any] = {"renderer": options.renderer, "mesh_is": options.mesh_is}

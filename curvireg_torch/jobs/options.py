@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import CurviregError, InvalidInputError
 from ..utils.choices import (
     BOX_FORMATS,
+    BOX_KINDS,
     DEFAULT,
     MESH_KINDS,
     PRESET_NAMES,
@@ -159,6 +160,12 @@ class RegisterOptions:
         "height in px; fractions: "
         "corners; yolo: centre, width, height in fractions of the picture",
         choices=BOX_FORMATS,
+    )
+    box_is: str | None = _option(
+        None,
+        "whole: boxes are those of the whole object. visible: those of its visible part, and "
+        "something may hide the rest (default: whole)",
+        choices=BOX_KINDS,
     )
     boxes: Path | None = _option(
         None,

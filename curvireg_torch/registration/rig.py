@@ -139,12 +139,13 @@ class RigPhotograph(Described):
         ).float()
         query = target.matcher.features(crop.to(target.bank.device))
         frame = target.frame_of(box, item.size)
+        shown = target.shown_around(box, item.size)
         mask = target.object_mask(query, [replace(item, box=boxes[0])])
         return RigPhotograph(
             index=index,
             camera=camera,
             photograph=replace(item, box=box),
-            crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
+            crops=EdgeCrops.cut([image], boxes, settings.margin, mask, shown=shown[None]),
             query=query,
             rankings=[result.ranking],
             descriptor=target.describer.descriptor(shown_in(frame, query.field)),

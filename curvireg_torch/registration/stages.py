@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..errors import CurviregError
 from ..fitting.edges import EdgeCrops
-from ..geometry.framing import shown_in, whole_boxes
+from ..geometry.framing import hidden_boxes, shown_in, whole_boxes
 from ..matching import Ranking
 from ..matching.search import search
 from ..terms import QueryFeatures
@@ -58,6 +58,7 @@ BLOCK = {"cpu": 16}
 Measured on a CPU, 16 photographs of one mesh: blocks of 16 take 9 to 12 % less processor time than
 blocks of 8, and 4 to 8 % more memory (1.14 GB at 640 x 480, 1.71 GB at 4000 x 3000)."""
 BLOCK_OF_DEVICE = 64
+VIEWS_OF_HIDDEN = 4  # best views that are tried in each box of an object behind an occluder
 
 
 def _block_size(device: str) -> int:
@@ -166,6 +167,8 @@ def _other_box(target: Target, item: Photograph, result: Registration) -> Tensor
     """The box of the pose that was found, if the photograph shows another part in it."""
     # Without a camera, poses are derived from their boxes.
     if not (target.pipeline.box_jitter and target.pipeline.contours and result.camera is not None):
+        return None
+    if target.boxes_are_visible:  # the pose's box is that of the whole object
         return None
     box = projected_box(target.describer, result.projection)
     # in a frame and without one, similarities mean different things
@@ -283,7 +286,8 @@ def rank(target: Target, photographs: Sequence[Photograph], query: QueryFeatures
     if target.pipeline.contours:
         mask = target.object_mask(query, photographs)
         images = [item.image for item in photographs]
-        crops = EdgeCrops.cut(images, boxes, target.bank.settings.margin, mask)
+        shown = torch.stack([target.shown_around(item.box, item.size) for item in photographs])
+        crops = EdgeCrops.cut(images, boxes, target.bank.settings.margin, mask, shown=shown)
     frames = [target.frame_of(item.box, item.size) for item in photographs]
     fields = [shown_in(frame, field) for frame, field in zip(frames, query.field, strict=True)]
     keypoints = [
@@ -360,33 +364,45 @@ def _promising(target: Target, block: Block) -> Hypotheses:
     places = (~block.tried_cameras).nonzero()[:, 0].tolist()
     rankings = [block.rankings[p] for p in places]
     boxes = block.boxes
-    poses = _of_best_views(target, block, rankings, places, boxes[places], screened)
+    counts = [screened] * len(places)
+    poses = _of_best_views(target, block, rankings, places, boxes[places], counts)
     if block.crops is None:
         return poses
     photographs = torch.bincount(poses.photograph, minlength=len(block))
     few = (photographs <= count)[poses.photograph]
     parts = [poses[few], _screened(target, block.crops, poses[~few], count)]
-    beyond = _beyond_the_border(target, block, screened)
+    beyond = _in_larger_boxes(target, block, screened)
     if beyond is not None:
         parts.append(_screened(target, block.crops, beyond, count))
     return Hypotheses.cat(parts)
 
 
-def _beyond_the_border(target: Target, block: Block, count: int) -> Hypotheses | None:
-    """Poses of the best views in the larger boxes of photographs whose border cuts theirs."""
+def _in_larger_boxes(target: Target, block: Block, count: int) -> Hypotheses | None:
+    """Poses of the best views in the larger boxes that whole objects may have: those of photographs
+    whose border cuts theirs, and of visible parts."""
     larger = [
-        (p, box)
+        (p, box, views)
         for p, item in enumerate(block.photographs)
         if block.frames[p] is not None and not bool(block.tried_cameras[p])
-        for box in whole_boxes(item.box, item.size)
+        for box, views in _larger_boxes(target, item, count)
     ]
     if not larger:
         return None
-    places = [p for p, _ in larger]
-    boxes = torch.stack([box for _, box in larger])
+    places = [p for p, _, _ in larger]
+    boxes = torch.stack([box for _, box, _ in larger])
+    counts = [views for _, _, views in larger]
     query = target.matcher.query([block.photographs[p].image for p in places], boxes)
     rankings = _rankings(target, query, [block.limits[p] for p in places])
-    return _of_best_views(target, block, rankings, places, boxes, count)
+    return _of_best_views(target, block, rankings, places, boxes, counts)
+
+
+def _larger_boxes(target: Target, item: Photograph, count: int) -> list[tuple[Tensor, int]]:
+    """Boxes that the whole object may have which a photograph shows a part of, and how many views
+    are tried in each: ``count`` beyond the border, and fewer in the many behind an occluder."""
+    boxes = [(box, count) for box in whole_boxes(item.box, item.size)]
+    if target.boxes_are_visible:
+        boxes += [(box, VIEWS_OF_HIDDEN) for box in hidden_boxes(item.box)]
+    return boxes
 
 
 def _of_best_views(
@@ -395,13 +411,13 @@ def _of_best_views(
     rankings: Sequence[Ranking],
     places: Sequence[int],
     boxes: Tensor,
-    count: int,
+    counts: Sequence[int],
 ) -> Hypotheses:
-    """Poses of the ``count`` best distinct views of each of R rankings, of the photographs
-    ``places`` with ``boxes`` (R, 4)."""
+    """Poses of the best distinct views of each of R rankings, R ``counts`` of them, of the
+    photographs ``places`` with ``boxes`` (R, 4)."""
     found = [
         best_views(ranking, target.bank, count=count, symmetries=block.symmetries)
-        for ranking in rankings
+        for ranking, count in zip(rankings, counts, strict=True)
     ]
     which = torch.arange(len(places)).repeat_interleave(
         torch.tensor([len(view) for view, _ in found], dtype=torch.long)
@@ -457,7 +473,7 @@ def fit(target: Target, block: Block, crops: EdgeCrops, starts: Hypotheses) -> H
         fitted, _ = with_short_fit(target.describer, crops, starts[unknown])
         starts = starts.replaced(unknown, fitted)
     finish = torch.where(block.tried_cameras, FINISHED, target.pipeline.fit.finished_fits)
-    # at the border as many poses of larger boxes compete
+    # in a frame as many poses of larger boxes compete
     in_frame = torch.tensor([frame is not None for frame in block.frames])
     finish = torch.where(in_frame, 2 * finish, finish)[starts.photograph]
     return fitted_poses(target, block, crops, starts, short_fits=starts.short_fit, finish=finish)
@@ -535,7 +551,7 @@ def _searched(target: Target, block: Block) -> list[Registration]:
     results = []
     for p, (ranking, query) in enumerate(zip(block.rankings, block.query.split(), strict=True)):
         count = target.pipeline.hypotheses
-        poses = _of_best_views(target, block, [ranking], [p], block.boxes[p : p + 1], count)
+        poses = _of_best_views(target, block, [ranking], [p], block.boxes[p : p + 1], [count])
         rotation, distance = search(target.matcher, query, ranking)
         found = Hypotheses.in_boxes(
             target.describer,

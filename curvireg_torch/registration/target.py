@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..evidence import RANK_ALONE, EvidenceWeights
 from ..fitting.keypoints import KeypointMatches, Keypoints
-from ..geometry.framing import CropFrame, border_sides
+from ..geometry.framing import CropFrame, around_visible, border_sides, photograph_box
 from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber, ViewMatcher
 from ..matching.detector import Detector
@@ -156,19 +156,33 @@ class Target:
 
     def frame_of(self, box: Tensor, size: tuple[int, int]) -> CropFrame | None:
         """The frame in which fitted poses are compared with a box (4,) at the border of a
-        photograph of ``size`` (H, W). None inside of it: the view of a pose that is a little off
-        resembles the object more by itself. None for a similar mesh, without the contour fit, and
-        for orthographic views, too."""
+        photograph of ``size`` (H, W), or of a visible part. None for other boxes: the view of a
+        pose that is a little off resembles the object more by itself. None for a similar mesh,
+        without the contour fit, and for orthographic views, too."""
         if not self.has_frame(box, size):
             return None
         settings = self.bank.settings
-        return CropFrame.of(box, size, side=settings.image_size, margin=settings.margin)
+        shown = self.shown_around(box, size)
+        return CropFrame.of(box, shown, side=settings.image_size, margin=settings.margin)
 
     def has_frame(self, box: Tensor, size: tuple[int, int]) -> bool:
         """Whether there is a :meth:`frame_of` a box."""
+        return self._has_frames and (self.boxes_are_visible or border_sides(box, size) > 0)
+
+    @property
+    def _has_frames(self) -> bool:
         is_fitted = self.is_exact and self.pipeline.contours
-        is_perspective = self.bank.settings.camera != "orthographic"
-        return is_fitted and is_perspective and border_sides(box, size) > 0
+        return is_fitted and self.bank.settings.camera != "orthographic"
+
+    @property
+    def boxes_are_visible(self) -> bool:
+        """Whether boxes count as those of the visible part, behind which the object may go on."""
+        return self._has_frames and self.pipeline.box_is == "visible"
+
+    def shown_around(self, box: Tensor, size: tuple[int, int]) -> Tensor:
+        """(4,) the part of a photograph of ``size`` (H, W) that poses are compared with in a box
+        (4,)."""
+        return around_visible(box, size) if self.boxes_are_visible else photograph_box(size)
 
     @property
     def uses_keypoints(self) -> bool:

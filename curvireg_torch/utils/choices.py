@@ -62,6 +62,9 @@ START_CONVENTIONS = ("opencv", "opengl")
 MESH_KINDS = ("exact", "similar")
 """Whether a mesh is that of the photographed object itself, or of another one of its kind."""
 
+BOX_KINDS = ("whole", "visible")
+"""Whether boxes are those of whole objects, or of what photographs show of them."""
+
 SIDE_NAMES = (
     "front",
     "front-right",

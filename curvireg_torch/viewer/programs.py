@@ -15,6 +15,7 @@ _OPTIONS = (
     "textures",
     "up",
     "pose",
+    "box_is",
     "mesh_is",
     "preset",
     "pipeline",
@@ -87,8 +88,13 @@ def _pipeline(request: RegisterOptions) -> str:
     """The pipeline of a request as Python, empty for the default one, or that of a bank."""
     pipeline = f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else ""
     pipeline = f"cr.pipeline.PRESETS[{request.preset!r}]" if request.preset else pipeline
+    changes = ""
     if request.pose:
-        return f"{pipeline or 'cr.Pipeline()'}.with_pose_prior({request.pose!r})"
+        changes = f".with_pose_prior({request.pose!r})"
+    if request.box_is:
+        changes = f"{changes}.with_boxes({request.box_is!r})"
+    if changes:
+        return f"{pipeline or 'cr.Pipeline()'}{changes}"
     return "" if request.bank_decides else pipeline
 
 

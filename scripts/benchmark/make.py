@@ -52,6 +52,7 @@ CADS = ("exact", "similar", "wrong", "print", "mirrored", "variant")
 # fraction of the surface that has the same material after a symmetry of the appearance
 SAME_LOOK = 0.97
 TWIN = 100_000  # added to the number of an object with another print, or of its mirror image
+ATTEMPTS = 60  # at a scene of which the right fraction is hidden
 MIN_PIXELS = 400  # of a silhouette; smaller ones are not annotated
 PART_AREA = (0.08, 0.5)  # fraction of the surface that differs in a variant
 # factor between the proportions of similar objects; if none is within it, the closest is taken
@@ -339,7 +340,7 @@ def compose(
         if options.bare and rng.random() < options.bare:
             mesh = mesh.recoloured(Texture(random_colour(rng)[None, None].astype(np.float32)))
         upright = options.pose == "upright" or (options.pose == "mixed" and index % 2 == 0)
-        occluded = bool(rng.random() < 0.3 and attempt < 12)
+        occluded = bool(options.hidden or (rng.random() < 0.3 and attempt < 12))
         more = {"upright": upright, "occluded": occluded, "cameras": options.cameras, "size": size}
         scene = single(mesh, shown, objects.clutter, objects.texture, rng, **more)
         named = shown
@@ -371,17 +372,19 @@ def make_scene(objects: Packages, options: Namespace, index: int) -> list[list[f
     if folder.exists():
         infos = read_json(folder / "scene_gt_info.json")
         return [[entry["visib_fract"] for entry in infos[key]] for key in sorted(infos, key=int)]
-    for attempt in range(20):
+    least, most = options.hidden or (0.0, options.occlusion)
+    for attempt in range(ATTEMPTS):
         scene, annotated = compose(objects, options, index, attempt)
         pictures = [scene.render(view, tuple(options.size)) for view in scene.views]
         wholes = np.array([p.whole.sum(axis=(1, 2)) for p in pictures])
         fractions = np.array([p.seen.sum(axis=(1, 2)) for p in pictures]) / np.maximum(wholes, 1)
+        is_hidden = 1.0 - fractions
         if (wholes[:, 0] >= MIN_PIXELS).all() and (
-            options.kind == "shelf" or fractions.min() >= 1.0 - options.occlusion
+            options.kind == "shelf" or (is_hidden.min() >= least and is_hidden.max() <= most)
         ):
             break
     else:
-        raise RuntimeError(f"scene {index}: the object is hidden in every attempt")
+        raise RuntimeError(f"scene {index}: too much or too little is hidden in every attempt")
     part = folder.with_suffix(".part")
     shutil.rmtree(part, ignore_errors=True)
     (part / "rgb").mkdir(parents=True)
@@ -494,6 +497,13 @@ def arguments() -> ArgumentParser:
     )
     parser.add_argument(
         "--occlusion", type=float, default=0.6, help="largest hidden fraction of a target"
+    )
+    parser.add_argument(
+        "--hidden",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        help="fraction of every target behind an occluder",
     )
     parser.add_argument(
         "--cut",

@@ -40,6 +40,12 @@ def test_register_writes_result_and_overlay(register_one, document, tmp_path, ca
     assert "standard deviations: " in printed
 
 
+def test_register_is_told_that_a_box_is_that_of_the_visible_part(register_one, document):
+    for words, box_is in (((), "whole"), (("--box-is", "visible"), "visible")):
+        assert register_one("--no-refine", *words) == 0
+        assert document()["pipeline"]["box_is"] == box_is
+
+
 def test_register_without_box_and_camera(folder, register_one, document, capsys):
     words = [
         "register",

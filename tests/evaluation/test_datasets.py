@@ -67,6 +67,19 @@ def test_evaluate_bop(bop, tmp_path):
     assert all(row["t"][2] > 0 for row in table)
 
 
+def test_boxes_of_visible_parts_reach_the_registrar_with_what_they_are(bop, tmp_path):
+    protocol = Protocol(pose="any", box_is="visible")
+    benchmark = BOPBenchmark(bop, protocol)
+    seen = torch.tensor([1.0, 2.0, 30.0, 40.0])
+    assert benchmark._entry({**benchmark.samples[0], "box_visible": seen}).box == (1, 2, 30, 40)
+    without = {k: v for k, v in benchmark.samples[0].items() if k != "box_visible"}
+    assert benchmark._entry(without).error == "unknown_box"
+    known = {**benchmark.samples[0], "box_visible": seen}
+    assert BOPBenchmark(bop, Protocol(pose="any"))._entry(known).box != (1, 2, 30, 40)
+    summary = run(benchmark, tmp_path, limit=1)
+    assert summary["settings"]["pipeline"]["box_is"] == "visible"
+
+
 def test_objects_fail_alone(bop, tmp_path):
     benchmark = BOPBenchmark(bop, Protocol(pose="any"))
     first, second, third = benchmark.entries[:3]

@@ -18,6 +18,7 @@ def test_parse_and_str_are_inverse():
         "box=0.2 seed=7": "0.2 seed=7",
         "box=annotated": "annotated",
         "box=none": "none",
+        "box_is=visible": "annotated box_is=visible",
     }
     for words, box in {**boxes, "views=3 seed=2": "annotated views=3 seed=2"}.items():
         protocol = Protocol.parse(words.split())

@@ -12,9 +12,10 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.fitting import contour_fit
 from curvireg_torch.fitting.contour_fit import fit_to_edges, short_fit
 from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
-from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask, inside_photographs
+from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask, inside_boxes
 from curvireg_torch.fitting.least_squares import apply_twist, project
 from curvireg_torch.fitting.measured_fit import contour_support
+from curvireg_torch.geometry.framing import photograph_box
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
@@ -158,8 +159,8 @@ def test_edges_outside_the_photograph_do_not_count():
     few = uv.index_fill(1, torch.tensor([1]), 50.0)
     assert edges.counts(few, valid, FIRST).tolist() == [[True, True, True]]
     # A box whose right half lies beyond the border of a photograph 20 px wide.
-    inside = inside_photographs(
-        [torch.zeros(3, 40, 20)], torch.tensor([[9.5, 9.5, 29.5, 29.5]]), 40, 0.0
+    inside = inside_boxes(
+        photograph_box((40, 20))[None], torch.tensor([[9.5, 9.5, 29.5, 29.5]]), 40, 0.0
     )
     assert bool(inside[0, 0, :, :20].all())
     assert float(inside[0, 0, :, 21:].max()) == 0.0

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from curvireg_torch import Pipeline
-from curvireg_torch.geometry.framing import CropFrame
+from curvireg_torch.geometry.framing import CropFrame, photograph_box
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration.block import Described, counting_keypoints, evidence_of
@@ -19,7 +19,8 @@ from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene
 
 def frame_of(target: Any, box: Tensor) -> CropFrame:
     settings = target.bank.settings
-    return CropFrame.of(box, SIZE, side=settings.image_size, margin=settings.margin)
+    shown = photograph_box(SIZE)
+    return CropFrame.of(box, shown, side=settings.image_size, margin=settings.margin)
 
 
 @pytest.mark.parametrize(("chance", "expected"), [(2, [0.0, 0.0, 1.0, 20.0]), (0, [0, 2, 3, 22])])

@@ -11,6 +11,7 @@ from curvireg_torch.geometry.framing import (
     border_sides,
     clipped,
     outside_fraction,
+    photograph_box,
     shown_in,
     whole_boxes,
 )
@@ -106,7 +107,7 @@ def test_whole_boxes_go_on_beyond_the_border_alone():
 def test_frame_knows_what_of_a_crop_lies_in_the_photograph():
     # a square of 80 px without margin that goes on for 20 px to the left and 30 px below
     box = torch.tensor([-20.5, 49.5, 59.5, 129.5])
-    frame = CropFrame.of(box, (100, 200), side=16, margin=0.0)
+    frame = CropFrame.of(box, photograph_box((100, 200)), side=16, margin=0.0)
     corners = torch.tensor([[-20.5, 49.5, 1.0], [59.5, 129.5, 1.0]]).double()
     expected = torch.tensor([[-0.5, -0.5, 1.0], [15.5, 15.5, 1.0]]).double()
     torch.testing.assert_close(corners @ frame.transform.T, expected)

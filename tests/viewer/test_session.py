@@ -21,6 +21,7 @@ from curvireg_torch.jobs.options import WITHIN, RegisterOptions
 from curvireg_torch.jobs.store import to_json
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.viewer import programs
 from curvireg_torch.viewer import session as module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.shot import dragged_box
@@ -215,6 +216,12 @@ def test_the_python_program_gives_the_same_numbers(session, registered):
     assert f"'rotation': {session.shot.answer.pose.rotation.tolist()}" in session.python()
 
 
+def test_the_python_program_says_what_boxes_are():
+    options = RegisterOptions(pose="upright", box_is="visible")
+    made = programs._pipeline(options)
+    assert made == "cr.Pipeline().with_pose_prior('upright').with_boxes('visible')"
+
+
 def test_move_without_a_camera_keeps_the_allocentric_rotation(session, monkeypatch):
     registrar = session.shot.result.registrar
     monkeypatch.setattr(registrar, "mesh_is", "similar")  # no focal length is estimated
@@ -355,7 +362,8 @@ def test_distortion_is_removed_from_all_photographs(folder):
 
 
 def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
-    session = new_session("--unit", "mm", "--up=-y", "--pose", "any", "--preset", "fast")
+    words = ["--pose", "any", "--box-is", "visible", "--preset", "fast"]
+    session = new_session("--unit", "mm", "--up=-y", *words)
     session.open_photo(Path("photo.png"))
     assert not session.has_exif
     with_exif(folder / "photo.png", exif(1, 50))
@@ -364,7 +372,7 @@ def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
     session.set_camera(guess="exif")
     assert session.command() == (
         "curvireg register photo.png MESH --box 10 20.5 90 80 --camera exif "
-        "--unit mm --up=-y --pose any --preset fast --out result"
+        "--unit mm --up=-y --pose any --box-is visible --preset fast --out result"
     )
     session.set_camera((300.0, 300.5, 119.5, 89.5))
     assert "--camera 300 300.5 119.5 89.5 --unit" in session.command()
