@@ -10,6 +10,7 @@ import torch
 
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import demo_scene, example_mesh
+from curvireg_torch.viewer.examination import TOO_LONG
 from curvireg_torch.visualization.encoding import png, to_uint8
 from tests.viewer.browser import MISSING
 
@@ -351,9 +352,13 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
         lambda: browser.text("photograph-facts") == "photo.png: 240 x 180 px", "photograph"
     )
     browser.wait(lambda: browser.text("mesh-facts").startswith("truck.ply: "), "mesh")
-    browser.wait(
-        lambda: browser.text("mesh-advice") == "grey mesh: its sides differ in shape", "advice", 300
-    )
+
+    def is_examined():
+        if browser.text("mesh-advice") == TOO_LONG:  # on a busy machine
+            browser.click("examine")
+        return browser.text("mesh-advice") == "grey mesh: its sides differ in shape"
+
+    browser.wait(is_examined, "advice", 600)
     (folder / "other.png").write_bytes((folder / "photo.png").read_bytes())
     for name in ("other.png", "photo.png"):  # photo.png for the second time
         browser.upload("photograph", folder / name)
@@ -438,18 +443,30 @@ def test_an_answer_is_zoomed_to_and_the_pointer_shows_what_a_drag_does(browser, 
     browser.wait(lambda: browser.text("photograph-facts").startswith("photo.png: "), "photograph")
     canvas = browser.part("photograph")
     browser.wait(lambda: canvas.find_element("css selector", "img").size["width"] > 100, "shown")
-    whole = canvas.size["width"]
     browser.drag((102, 70), (156, 147), 240)
     browser.wait(lambda: browser.box() is not None, "box")
     browser.click("register")
     browser.wait(lambda: browser.text("progress") == "done", "result")
     browser.wait(lambda: canvas.get_attribute("data-object"), "its extent")
-    x0, y0, x1, y1 = map(float, canvas.get_attribute("data-object").split())
-    zoom = max(1.0, 0.6 / max(x1 - x0, y1 - y0))
-    assert zoom > 1.1, "the test needs a small object"
-    browser.wait(lambda: canvas.size["width"] == pytest.approx(zoom * whole, abs=3), "the object")
+
+    def extent():
+        return [float(value) for value in canvas.get_attribute("data-object").split()]
+
+    def zoom_to_object():
+        x0, y0, x1, y1 = extent()
+        return max(1.0, 0.6 / max(x1 - x0, y1 - y0))
+
+    def is_zoomed():
+        zoom = float(canvas.get_attribute("data-zoom"))
+        return zoom == pytest.approx(zoom_to_object(), abs=0.01)
+
+    assert zoom_to_object() > 1.1, "the test needs a small object"
+    browser.wait(is_zoomed, "the object")
+    large = canvas.size["width"]
     ActionChains(browser.driver).send_keys("z").perform()
-    browser.wait(lambda: canvas.size["width"] == whole, "the whole photograph")
+    browser.wait(lambda: canvas.get_attribute("data-zoom") == "1", "the whole photograph")
+    whole = canvas.size["width"]
+    assert large == pytest.approx(zoom_to_object() * whole, rel=0.03)  # a scroll bar takes some
     browser.driver.find_element("css selector", "[data-zoom=fit]").click()
     browser.wait(lambda: canvas.size["width"] > 1.05 * whole, "the object again")
     browser.driver.find_element("css selector", "[data-zoom=fit]").click()
@@ -461,8 +478,9 @@ def test_an_answer_is_zoomed_to_and_the_pointer_shows_what_a_drag_does(browser, 
         ActionChains(browser.driver).move_to_element_with_offset(canvas, *offset).perform()
         return canvas.get_attribute("data-aim")
 
-    assert aim((x0 + x1) / 2, (y0 + y1) / 2) == "move"
-    assert aim(0.02, 0.02) == "turn"
+    x0, y0, x1, y1 = extent()
+    browser.wait(lambda: aim((x0 + x1) / 2, (y0 + y1) / 2) == "move", "the mesh would move")
+    browser.wait(lambda: aim(0.02, 0.02) == "turn", "the mesh would turn")
     lines = canvas.find_elements("css selector", "img")[2]
     assert lines.is_displayed()
     browser.part("contours").click()

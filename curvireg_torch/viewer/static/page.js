@@ -115,7 +115,7 @@
   const outline = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
   let opaque = null;
 
-  addEventListener("load", (event) => {
+  document.addEventListener("load", (event) => {  // it does not reach the window
     if (!event.target.matches?.(".canvas img:nth-child(2)")) return;
     const [width, height] = [outline.canvas.width, outline.canvas.height] = [480, Math.round((480 * event.target.naturalHeight) / event.target.naturalWidth)];
     outline.drawImage(event.target, 0, 0, width, height);
