@@ -55,6 +55,9 @@ VERDICTS = {
     " ({confidence}). Its contours should fit better than those of the first.",
     "by hand": "You set this pose. How probable it is, nobody has measured.",
 }
+# Pictures a second of a scene, with and without the pointer on it
+FPS_IN_USE = 20
+FPS_AT_REST = 2
 UNDISTORTED = (
     "None: the command line takes the box in the photograph as it was taken, the page "
     "in the "
@@ -472,18 +475,30 @@ class Preview:
             self._draw(self.workspace.serve("model.glb", content, "model/gltf-binary"))
 
     def _draw(self, url: str) -> None:
-        look = {
-            "grid": False,
-            "camera": ui.scene.perspective_camera(fov=40),
-            "background_color": "#c8ced3",
-        }
-        with self.place, ui.scene(340, 240, on_click=self._clicked, **look) as scene:
+        with self.place, _scene(40, on_click=self._clicked) as scene:
             scene.gltf(url)
             for name, end in (("up", [0, 0, 1.0]), ("front", [0, -1.2, 0])):
                 scene.line([0, 0, 0], end).material("#0a6b35" if name == "up" else "#a8201a")
                 scene.text(name, "font-weight: bold; color: #1b1f23").move(*end)
         scene.move_camera(1.6, -2.6, 1.3, 0, 0, 0, duration=0)
         self.scene = scene
+
+
+def _scene(fov: float, on_click: Callable[..., Any] | None = None) -> ui.scene:
+    """A scene that is drawn often only while the pointer is on it: without a GPU, pictures cost the
+    processor that a search needs."""
+    scene = ui.scene(
+        340,
+        240,
+        grid=False,
+        camera=ui.scene.perspective_camera(fov=fov),
+        background_color="#c8ced3",
+        on_click=on_click,
+        fps=FPS_AT_REST,
+    )
+    scene.on("pointerenter", lambda: scene.props(f"fps={FPS_IN_USE}"))
+    scene.on("pointerleave", lambda: scene.props(f"fps={FPS_AT_REST}"))
+    return scene
 
 
 class Space:
@@ -524,12 +539,7 @@ class Space:
             torch.linalg.solve(K.double(), K.new_tensor([x, y, 1]).double()) for x, y in corners
         ]
         self.place.clear()
-        look = {
-            "grid": False,
-            "camera": ui.scene.perspective_camera(fov=50),
-            "background_color": "#c8ced3",
-        }
-        with self.place, ui.scene(340, 240, **look) as scene:
+        with self.place, _scene(50) as scene:
             # from glTF's axes, y up, to those of the scene, z up; the object is at distance 1
             scene.gltf(url).rotate(math.pi / 2, 0, 0).scale(1.0 / (depth * metres))
             for x, y, _ in (ray.tolist() for ray in rays):
