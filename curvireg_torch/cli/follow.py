@@ -178,8 +178,10 @@ class Tally:
 
         if self.frames != FRAMES_TO_LOCK or self.best_confidence >= BELIEVED_CONFIDENCE:
             return ""
-        best = two_decimals(self.best_confidence)
-        return f"not sure of the object yet (best confidence {best}); give --box or --start"
+        best = ""  # pipelines without calibration have no confidence
+        if self.best_confidence > 0.0:
+            best = f" (best confidence {two_decimals(self.best_confidence)})"
+        return f"not sure of the object yet{best}; give --box or --start"
 
     @property
     def posed(self) -> int:

@@ -58,6 +58,7 @@ def follow(frames):
         ((0.1, 0.2, 0.409, 0.3), ["", "", "not sure of the object yet (best confidence 0.40)", ""]),
         ((0.1, 0.5, 0.3, 0.3), [""] * 4),
         ((0.1, None, None), ["", "", "not sure of the object yet (best confidence 0.10)"]),
+        ((None, None, None), ["", "", "not sure of the object yet"]),
     ],
 )
 def test_frames_without_a_certain_pose_are_spoken_of_once(confidences, said):
