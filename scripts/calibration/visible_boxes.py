@@ -114,6 +114,7 @@ def main() -> None:
     )
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
     parser.add_argument("--full", type=int, default=4, help="of n fully visible ones, one is taken")
+    parser.add_argument("--meshes", type=int, help="of each folder; default: all")
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
     rows = []
@@ -126,7 +127,8 @@ def main() -> None:
             if is_within(known, HIDDEN) or is_taken:
                 of_mesh[int(known["obj_id"])].append(i)
         many_first = sorted(of_mesh.items(), key=lambda item: (-len(item[1]), item[0]))
-        tasks = [([obj_id, few], (folder, few)) for obj_id, few in many_first]
+        chosen = many_first[: options.meshes]
+        tasks = [([obj_id, few], (folder, few)) for obj_id, few in chosen]
         kept = folder / "visible_boxes.jsonl"
         rows += measured(kept, tasks, measure, options.jobs, folder.name)
     record: Row = {"date": today(), "commit": commit(), "folders": len(options.folders)}
