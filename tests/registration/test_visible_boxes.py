@@ -1,6 +1,7 @@
 """Boxes of what a photograph shows of an object that something else hides a part of."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,7 +15,8 @@ from curvireg_torch.geometry.framing import (
     photograph_box,
 )
 from curvireg_torch.registration.photograph import as_photograph
-from curvireg_torch.registration.stages import describe, rank
+from curvireg_torch.registration.rig import RigPhotograph
+from curvireg_torch.registration.stages import _other_box, describe, rank
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene
 
 
@@ -60,10 +62,12 @@ def test_what_lies_beside_a_visible_box_does_not_count():
         block = rank(registrar, [item], describe(registrar, [item]))
         points = torch.stack([middle, beside]).double()
         to_crop = block.crops.transforms[0]
+        result = SimpleNamespace(corrected_box=None, ranking=None)
+        of_rig = RigPhotograph.of(registrar, item, result, 0, torch.eye(4).double())
         uv = (points @ to_crop[:2, :2].T + to_crop[:2, 2])[None]
         valid = torch.ones(1, 2, dtype=torch.bool)
-        counts = block.crops.edges(1).counts(uv, valid, torch.tensor([0]))
-        assert int(counts.sum()) == count
+        for crops in (block.crops, of_rig.crops):
+            assert int(crops.edges(1).counts(uv, valid, torch.tensor([0])).sum()) == count
         shown = registrar.shown_around(item.box, item.size)
         is_whole = shown.equal(photograph_box(SIZE))
         assert is_whole == (block.frames[0] is None) == (count == 2)
@@ -74,7 +78,9 @@ def test_a_hidden_half_needs_a_box_that_is_said_to_be_visible(seed):
     image, box, T = half_hidden(seed)
     result = visible_registrar()([image], box[None], CAMERA)[0]
     assert errors(result, T)[0] < 10.0
-    assert result.corrected_box is None
+    item = as_photograph(image, box, CAMERA)
+    assert _other_box(visible_registrar(), item, result) is None
+    assert _other_box(learned_registrar(), item, result) is not None
     as_whole = learned_registrar()([image], box[None], CAMERA)[0]
     assert errors(as_whole, T)[0] > 15.0
     assert not as_whole.reliable
