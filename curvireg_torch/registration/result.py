@@ -323,9 +323,9 @@ class Registration:
 
     @property
     def ambiguous(self) -> str | None:
-        """How the first pose and its :func:`likely_rivals` differ: "half turn", "mirror" or
-        "several", as are those that only a hidden feature of the mesh tells apart; "mesh 0 or 1" of
-        meshes that are nearly as probable; else None."""
+        """How the first pose and those nearly as probable, or that make a reliable pair with it,
+        differ: "half turn", "mirror" or "several", as are those that only a hidden feature of the
+        mesh tells apart; "mesh 0 or 1" of meshes that are; else None."""
         if likely_meshes := self._likely_meshes:
             return f"mesh {' or '.join(str(k) for k in likely_meshes)}"
         likely = [0, *likely_rivals(self.probabilities, self.pair_probability)]
