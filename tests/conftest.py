@@ -8,7 +8,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
-import trimesh
 
 from curvireg_torch import ViewBank, sample_views
 from curvireg_torch.data import BOPDataset, Pascal3DPlus, PoseFolder
@@ -17,7 +16,7 @@ from tests._support import scenes
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config, items):
     """Leave out tests marked ``browser`` unless ``-m`` names them: they take long.
 
     Skip tests marked ``cuda`` where there is no GPU."""
@@ -32,19 +31,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture(scope="session")
-def truck() -> trimesh.Trimesh:
+def truck():
     """The example mesh, in metres."""
     return example_mesh()
 
 
 @pytest.fixture(scope="session")
-def bank() -> ViewBank:
+def bank():
     """120 views of the truck at 96 px, preset "classical"."""
     return scenes.truck_bank()
 
 
 @pytest.fixture(scope="session")
-def small_bank(truck: trimesh.Trimesh) -> ViewBank:
+def small_bank(truck):
     """24 views of the truck at 64 px, default pipeline."""
     views = sample_views(azimuth_step=30, elevations=[0, 30])
     return ViewBank.build(truck, views, image_size=64, progress=False)

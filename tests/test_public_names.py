@@ -12,13 +12,13 @@ PACKAGE = ROOT / "curvireg_torch"
 INITS = sorted(PACKAGE.rglob("__init__.py"))
 
 
-def dotted(path: Path) -> str:
+def dotted(path):
     """The name of a module, or of a package by its ``__init__.py``."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(part for part in parts if part != "__init__")
 
 
-def imported(tree: ast.Module, module: str, *, is_package: bool) -> list[tuple[str, str]]:
+def imported(tree, module, *, is_package):
     """The (module, name) pairs of ``from module import name``, relative ones made absolute."""
     here = module.split(".")
     pairs = []
@@ -31,7 +31,7 @@ def imported(tree: ast.Module, module: str, *, is_package: bool) -> list[tuple[s
 
 
 @pytest.mark.parametrize("path", INITS, ids=dotted)
-def test_packages_list_what_they_export(path: Path):
+def test_packages_list_what_they_export(path):
     tree = ast.parse(path.read_text(encoding="utf-8"))
     package = importlib.import_module(dotted(path))
     public = {
@@ -81,7 +81,7 @@ def test_public_functions_are_used_outside_their_modules():
         for path in sources
         if path.suffix in (".py", ".pyi", ".md")
     }
-    files_of: dict[str, set[Path]] = {}
+    files_of = {}
     for path, text in texts.items():
         for word in set(re.findall(r"\w+", text)):
             files_of.setdefault(word, set()).add(path)

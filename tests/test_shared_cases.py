@@ -4,7 +4,6 @@ states it. Registrations are left to the tests of the modules, which generate su
 import json
 import shutil
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -81,12 +80,12 @@ def test_boxes_in_fractions_are_named():
     assert item.message == FRACTIONS
 
 
-def dino() -> trimesh.Trimesh:
+def dino():
     folder = real_data("bop/dino")
     return trimesh.load_mesh(folder / "models" / "obj_000001.ply", process=False)
 
 
-def start(name: str) -> torch.Tensor:
+def start(name):
     (file,) = real_case(name).glob("*.json")
     values = json.loads(file.read_text())
     T = torch.eye(4, dtype=torch.float64)
@@ -128,7 +127,7 @@ def test_photographs_of_phones_are_listed_and_named():
             read_photo(path)
 
 
-def loaded(path: Path, **options) -> tuple[trimesh.Trimesh, str]:
+def loaded(path, **options):
     """A mesh, and its warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CurviregWarning)
@@ -136,7 +135,7 @@ def loaded(path: Path, **options) -> tuple[trimesh.Trimesh, str]:
     return mesh, "; ".join(warning.text for warning in mesh_warnings(mesh))
 
 
-def colours_of(mesh: trimesh.Trimesh) -> set[tuple[int, ...]]:
+def colours_of(mesh):
     colours = mesh.metadata.get("colours")
     return set() if colours is None else set(map(tuple, colours.corners.reshape(-1, 3).tolist()))
 
@@ -204,7 +203,7 @@ def test_meshes_that_are_cut_or_in_another_notation_are_refused(name, words):
         cr.load_mesh(real_case(folder) / file)
 
 
-def write_can(folder: Path, library: str) -> Path:
+def write_can(folder, library):
     """An OBJ of a can with texture coordinates and a material of a library."""
     mesh = can()
     lines = [f"mtllib {library}", "usemtl label"]
@@ -259,7 +258,7 @@ def test_meshes_far_away_and_with_stray_geometry_warn(tmp_path):
     np.testing.assert_allclose(found.extents, stray.extents, atol=1e-3)
 
 
-def bop_set(tmp_path: Path, name: str, scale: float = 1.0) -> Path:
+def bop_set(tmp_path, name, scale=1.0):
     """The set of a case, with the model that was left out of it."""
     root = shutil.copytree(real_case(name) / "set", tmp_path / "set")
     mesh = dino()
@@ -318,7 +317,7 @@ def test_a_matrix_of_the_picture_at_half_size_is_named():
     assert not item.warnings
 
 
-def area_of_polygons(path: Path) -> float:
+def area_of_polygons(path):
     """The area of the flat polygons of an OBJ, by the cross products of their corners."""
     lines = [line.split() for line in path.read_text().splitlines()]
     points = np.array([line[1:4] for line in lines if line[:1] == ["v"]], float)

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 
-def canister() -> trimesh.Trimesh:
+def canister():
     """A closed cylinder of radius 40 and height 120 about z with a narrower neck and two ports on
     its top: round but for these."""
     parts = [

@@ -10,7 +10,7 @@ from curvireg_torch.rendering import render_colour
 from tests._support.scenes import CAMERA, SIZE
 
 
-def can(word: str = "BEANS") -> trimesh.Trimesh:
+def can(word="BEANS"):
     """A closed cylinder about y with a label."""
     label = np.full((128, 256, 3), 235, np.uint8)
     label[:36] = (170, 30, 40)

@@ -2,9 +2,7 @@
 
 import gc
 import time
-from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
 
 from curvireg_torch.errors import CurviregError
 
@@ -13,7 +11,7 @@ MOST = 9.0  # times as long, for that factor: linear, with some noise
 SHORTEST = 0.005  # seconds of processor time of the smaller input that count
 
 
-def check_linear(read: Callable[[Any], object], make: Callable[[int], Any], size: int) -> None:
+def check_linear(read, make, size):
     """Assert that ``read(make(4 * size))`` takes about four times as long as ``read(make(size))``.
     Errors of ours are results too."""
     seconds = []
@@ -26,7 +24,7 @@ def check_linear(read: Callable[[Any], object], make: Callable[[int], Any], size
     )
 
 
-def _seconds(read: Callable[[Any], object], content: Any) -> float:
+def _seconds(read, content):
     gc.disable()  # what it takes depends on the tests before
     start = time.process_time()
     try:

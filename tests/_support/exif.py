@@ -1,9 +1,8 @@
 import struct
 import zlib
-from pathlib import Path
 
 
-def exif(orientation: int, focal: int = 0, order: str = ">") -> bytes:
+def exif(orientation, focal=0, order=">"):
     """A TIFF block with an orientation and, in its EXIF directory at byte 38, a 35 mm focal
     length."""
     start = {">": b"MM", "<": b"II"}[order] + struct.pack(order + "HI", 42, 8)
@@ -11,7 +10,7 @@ def exif(orientation: int, focal: int = 0, order: str = ">") -> bytes:
     return start + main + struct.pack(order + "HHHIHHI", 1, 0xA405, 3, 1, focal, 0, 0)
 
 
-def with_exif(path: Path, block: bytes) -> None:
+def with_exif(path, block):
     """Put ``block`` into a JPEG or PNG that has none."""
     data = path.read_bytes()
     if path.suffix == ".jpg":

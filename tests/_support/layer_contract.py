@@ -29,20 +29,20 @@ class LayerCase:
     min_size: int = 1
     accepts_colour: bool = True
 
-    def __call__(self, x: Tensor) -> Any:
+    def __call__(self, x):
         return self.function(x, **self.options)
 
-    def twin(self) -> nn.Module:
+    def twin(self):
         """The module with the same options; without one, the function is a module."""
         return self.function if self.module is None else self.module(**self.options)
 
 
-def tensors(output: Any) -> tuple[Tensor, ...]:
+def tensors(output):
     """The tensors of an output: itself, or those of a tuple."""
     return (output,) if isinstance(output, Tensor) else tuple(output)
 
 
-def degenerate_images() -> dict[str, Tensor]:
+def degenerate_images():
     x = torch.arange(16.0)
     bright = torch.zeros(1, 1, 16, 16)
     bright[..., 8, 8] = 1.0
@@ -66,11 +66,11 @@ class LayerContract:
     cases: ClassVar[Sequence[LayerCase]] = ()
     batch_tolerance: ClassVar[Mapping[str, float]] = {"rtol": 1e-6, "atol": 1e-9}
 
-    def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
+    def pytest_generate_tests(self, metafunc):
         if "case" in metafunc.fixturenames:
             metafunc.parametrize("case", self.cases, ids=[case.name for case in self.cases])
 
-    def agrees(self, got: Any, want: Any) -> bool:
+    def agrees(self, got, want):
         """Equality of compiled results: another order of summation flips single pixels at a
         threshold or a sign."""
         for a, b in zip(tensors(got), tensors(want), strict=True):
@@ -86,7 +86,7 @@ class LayerContract:
                 return False
         return True
 
-    def test_function_equals_module(self, case: LayerCase) -> None:
+    def test_function_equals_module(self, case):
         x = case.inputs(2, SIZE)
         before = x.clone()
         want = case(x)
@@ -98,7 +98,7 @@ class LayerContract:
             assert (y.device, len(y)) == (x.device, len(x))
             assert torch.isfinite(y).all()
 
-    def test_batched_equals_one_by_one(self, case: LayerCase) -> None:
+    def test_batched_equals_one_by_one(self, case):
         """The images differ in contrast and depth range, so that a normalisation over the batch is
         detected."""
         scale = torch.tensor([1.0, 0.1, 0.0], dtype=torch.float64).view(-1, 1, 1, 1)
@@ -109,13 +109,13 @@ class LayerContract:
         ]
         torch.testing.assert_close(tensors(case(x)), tuple(parts), **self.batch_tolerance)
 
-    def test_empty_batch(self, case: LayerCase) -> None:
+    def test_empty_batch(self, case):
         x = case.inputs(2, SIZE)
         for empty, full in zip(tensors(case(x[:0])), tensors(case(x)), strict=True):
             assert empty.shape == (0, *full.shape[1:])
 
     @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-    def test_dtype_is_kept(self, case: LayerCase, dtype: torch.dtype) -> None:
+    def test_dtype_is_kept(self, case, dtype):
         x = case.inputs(2, SIZE).to(dtype)
         y = case(x)
         assert {t.dtype for t in tensors(y)} == {dtype}
@@ -124,7 +124,7 @@ class LayerContract:
             torch.testing.assert_close(tensors(y), want, rtol=0.0, atol=0.0)
 
     @pytest.mark.parametrize("image", list(degenerate_images()))
-    def test_finite_on_degenerate_input(self, case: LayerCase, image: str) -> None:
+    def test_finite_on_degenerate_input(self, case, image):
         x = degenerate_images()[image]
         if min(x.shape[-2:]) < case.min_size:
             return
@@ -137,7 +137,7 @@ class LayerContract:
         if case.constant_gives_zero and image in ("zeros", "constant") and x.shape[1] == 1:
             assert all(float(t.detach().float().abs().max()) < 1e-6 for t in y)
 
-    def test_gradcheck(self, case: LayerCase) -> None:
+    def test_gradcheck(self, case):
         """At generic points, where no maximum, threshold or suppression switches within the
         step."""
         x = case.inputs(1, 9, seed=3, dtype=torch.float64)
@@ -148,7 +148,7 @@ class LayerContract:
         index = (x != 0).nonzero(as_tuple=True)
         weights = self.gradcheck_weights(case, x)
 
-        def function(values: Tensor) -> Tensor:
+        def function(values):
             return (
                 case.function(x.index_put(index, values), **case.options, **case.gradcheck_options)
                 * weights
@@ -160,20 +160,18 @@ class LayerContract:
             function, values, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True
         )
 
-    def gradcheck_weights(self, case: LayerCase, x: Tensor) -> float | Tensor:
+    def gradcheck_weights(self, case, x):
         """Factor on the output that excludes pixels where it is not differentiable."""
         return 1.0
 
     @pytest.mark.filterwarnings("ignore:There is a performance drop")
     @pytest.mark.parametrize("block", [None, SIZE**2])
-    def test_function_transforms(
-        self, case: LayerCase, block: int | None, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_function_transforms(self, case, block, monkeypatch):
         """vmap, reverse and forward derivatives; also of batches that are processed in blocks."""
         x = case.inputs(2, SIZE, dtype=torch.float64)
         halved = case(0.5 * x)
 
-        def loss(x: Tensor) -> Tensor:
+        def loss(x):
             return case(x).square().sum()
 
         want = torch.autograd.grad(loss(x.requires_grad_()), x)[0]
@@ -192,7 +190,7 @@ class LayerContract:
             dual = loss(torch.autograd.forward_ad.make_dual(x, direction))
             torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(dual).tangent, slope)
 
-    def test_bad_input_is_rejected(self, case: LayerCase) -> None:
+    def test_bad_input_is_rejected(self, case):
         x = case.inputs(1, SIZE)
         wrong = [
             (x[0], "expected shape"),
@@ -206,7 +204,7 @@ class LayerContract:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("dynamic", [False, True])
-    def test_compile_fullgraph(self, case: LayerCase, dynamic: bool) -> None:
+    def test_compile_fullgraph(self, case, dynamic):
         """Compiled by inductor for one size, and traced as one graph for any size."""
         torch._dynamo.reset()
         options = {"dynamic": True, "backend": "eager"} if dynamic else {}
@@ -216,7 +214,7 @@ class LayerContract:
             assert self.agrees(graph(x), case(x))
 
     @pytest.mark.slow
-    def test_export_with_any_batch(self, case: LayerCase) -> None:
+    def test_export_with_any_batch(self, case):
         batch = torch.export.Dim("batch", min=1, max=64)
         program = torch.export.export(
             case.twin(), (case.inputs(3, SIZE),), dynamic_shapes=({0: batch},)

@@ -1,22 +1,18 @@
 """A fixture of the tests of meshes."""
 
 import warnings
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
-import trimesh
 
 import curvireg_torch as cr
 
 
 @pytest.fixture
-def load() -> Callable[..., tuple[trimesh.Trimesh, list[str]]]:
+def load():
     """A function that loads a mesh, and returns it with the texts of its warnings, but for that of
     its size."""
 
-    def read(path: Path, **options: Any) -> tuple[trimesh.Trimesh, list[str]]:
+    def read(path, **options):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             mesh = cr.load_mesh(path, **options)

@@ -2,8 +2,6 @@
 is photographed."""
 
 import json
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +11,7 @@ import trimesh
 HALF = 0.25  # half the edge of the cube that all meshes are
 
 
-def write_image(path: Path, size: tuple[int, int] = (60, 80), seed: int = 0) -> None:
+def write_image(path, size=(60, 80), seed=0):
     """A photograph of noise, ``size`` = (H, W)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(
@@ -21,13 +19,13 @@ def write_image(path: Path, size: tuple[int, int] = (60, 80), seed: int = 0) -> 
     )
 
 
-def write_mesh(path: Path, half: float = HALF) -> None:
+def write_mesh(path, half=HALF):
     """A cube about the origin, in the format of the suffix."""
     path.parent.mkdir(parents=True, exist_ok=True)
     trimesh.creation.box((2 * half,) * 3).export(path)
 
 
-def pascal_object(category: str, **changes: Any) -> dict[str, Any]:
+def pascal_object(category, **changes):
     """One entry of ``record.objects``; ``viewpoint`` is merged, other changes replace."""
     view = {
         "azimuth_coarse": 45.0,
@@ -44,7 +42,7 @@ def pascal_object(category: str, **changes: Any) -> dict[str, Any]:
         "error": np.nan,
         "viewport": 3000.0,
     }
-    entry: dict[str, Any] = {
+    entry = {
         "class": category,
         "view": "",
         "truncated": 0,
@@ -58,7 +56,7 @@ def pascal_object(category: str, **changes: Any) -> dict[str, Any]:
     return {**entry, **changes}
 
 
-def _struct_array(objects: list[dict[str, Any]]) -> np.ndarray:
+def _struct_array(objects):
     keys = list(dict.fromkeys(key for entry in objects for key in entry))
     array = np.empty((1, len(objects)), dtype=[(key, object) for key in keys])
     for i, entry in enumerate(objects):
@@ -66,7 +64,7 @@ def _struct_array(objects: list[dict[str, Any]]) -> np.ndarray:
     return array
 
 
-def write_record(path: Path, objects: list[dict[str, Any]]) -> None:
+def write_record(path, objects):
     path.parent.mkdir(parents=True, exist_ok=True)
     record = {
         "filename": f"{path.stem}.jpg",
@@ -76,7 +74,7 @@ def write_record(path: Path, objects: list[dict[str, Any]]) -> None:
     scipy.io.savemat(path, {"record": record}, do_compression=True)
 
 
-def write_pascal3d(root: Path, part: str = "pascal") -> dict[str, int]:
+def write_pascal3d(root, part="pascal"):
     """A tree of cars and sofas in the layout of release 1.1; returns how often each reason must be
     counted."""
     annotations = root / "Annotations" / f"car_{part}"
@@ -84,7 +82,7 @@ def write_pascal3d(root: Path, part: str = "pascal") -> dict[str, int]:
     suffix = ".jpg" if part == "pascal" else ".JPEG"
     unset = {"azimuth": 0.0, "elevation": 0.0, "distance": 0.0, "theta": 0.0}
     empty = np.empty((0, 0))
-    records: dict[str, list[dict[str, Any]]] = {
+    records = {
         "2008_000001": [pascal_object("car")],
         "2008_000002": [
             pascal_object("sofa"),
@@ -144,7 +142,7 @@ def write_pascal3d(root: Path, part: str = "pascal") -> dict[str, int]:
     }
 
 
-def write_bop(root: Path) -> dict[str, int]:
+def write_bop(root):
     """Two scenes (rgb and grey) of cubes in the BOP layout; returns how often each reason must be
     counted."""
     R = [1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]
@@ -202,7 +200,7 @@ def write_bop(root: Path) -> dict[str, int]:
     return reasons | {"bad_box": 1, "missing_image": 1, "missing_annotation": 2}
 
 
-def write_web(root: Path) -> dict[str, int]:
+def write_web(root):
     """Two usable objects and two defective folders; returns how often each reason must be
     counted."""
     header = "image,x0,y0,x1,y1,azimuth,elevation,theta,distance\n"
@@ -230,6 +228,6 @@ def write_web(root: Path) -> dict[str, int]:
     }
 
 
-def _write_json(path: Path, content: Any) -> None:
+def _write_json(path, content):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content))

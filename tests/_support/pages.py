@@ -24,11 +24,11 @@ STEP = re.compile(
 )
 
 
-def steps(page: Path) -> list[tuple[str, str]]:
+def steps(page):
     """The steps of a page in order: ("python", a block) and ("command", a line): lines of bash
     blocks, lines of plain blocks that start with a program, and inline commands that have an
     ``--out`` or run a script."""
-    found: list[tuple[str, str]] = []
+    found = []
     for block in STEP.finditer(page.read_text(encoding="utf-8")):
         kind = block["kind"]
         code = block["code"]
@@ -44,6 +44,6 @@ def steps(page: Path) -> list[tuple[str, str]]:
     return found
 
 
-def split_command(line: str) -> list[str]:
+def split_command(line):
     """The words of a command without its comment."""
     return shlex.split(line, comments=True)

@@ -2,19 +2,15 @@
 
 import json
 import shutil
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from curvireg_torch import render_depth
 
 
-def write_peers(folder: Path, photo: Path, mesh: trimesh.Trimesh, T: Tensor, K: Tensor) -> None:
+def write_peers(folder, photo, mesh, T, K):
     """Write ``megapose``, ``foundationpose``, ``bop``, detections and masks of a photograph into
     ``folder``.
 
@@ -96,6 +92,6 @@ def write_peers(folder: Path, photo: Path, mesh: trimesh.Trimesh, T: Tensor, K: 
     )
 
 
-def _write(path: Path, content: Any) -> None:
+def _write(path, content):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content))

@@ -4,16 +4,15 @@ geometry."""
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 
-def rotations(n: int, seed: int) -> Tensor:
+def rotations(n, seed):
     return torch.from_numpy(
         Rotation.random(n, random_state=np.random.RandomState(seed)).as_matrix().reshape(n, 3, 3)
     )
 
 
-def poses(n: int, seed: int, *, near: Tensor | None = None) -> Tensor:
+def poses(n, seed, *, near=None):
     """(n, 4, 4) float64, about 5 units ahead of the camera; or small disturbances of the poses
     ``near``."""
     rng = np.random.default_rng(seed)

@@ -1,12 +1,9 @@
 """Tests of which one example is quick enough for every run."""
 
-from collections.abc import Iterable
-from typing import Any
-
 import pytest
 
 
-def slow_after(count: int, cases: Iterable[Any]) -> list[Any]:
+def slow_after(count, cases):
     """The parameters of a test, a value or a tuple each; those after the first ``count`` are
     marked ``slow``."""
     cases = list(cases)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 
-def real_data(name: str) -> Path:
+def real_data(name):
     """The folder ``name`` of the shared data; skips the test where it is absent."""
     root = _shared_data()
     if not (root / name).is_dir():
@@ -16,13 +16,13 @@ def real_data(name: str) -> Path:
     return root / name
 
 
-def real_case(name: str) -> Path:
+def real_case(name):
     """The folder ``name`` of the cases that users reported, in tests/data/cases."""
     folder = Path(__file__).parents[1] / "data" / "cases" / name
     assert folder.is_dir(), f"no case {name}"
     return folder
 
 
-def _shared_data() -> Path:
+def _shared_data():
     given = os.environ.get("CURVIREG_SHARED_DATA")
     return Path(given or Path(__file__).parents[3] / "shared" / "data")

@@ -2,16 +2,13 @@
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import cv2
 import torch
-from torch import Tensor
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
-from curvireg_torch.pipeline import PRESETS, Pipeline
+from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration.result import Detection
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
@@ -20,7 +17,7 @@ CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
 
 
 @cache
-def truck_bank() -> ViewBank:
+def truck_bank():
     views = sample_views(azimuth_step=15, elevations=[0, 15, 30, 45, 60])
     return ViewBank.build(
         example_mesh(), views, pipeline=PRESETS["classical"], image_size=96, progress=False
@@ -28,14 +25,14 @@ def truck_bank() -> ViewBank:
 
 
 @cache
-def learned_registrar() -> Registrar:
+def learned_registrar():
     """A registrar of the truck with the default pipeline, whose results have a confidence."""
     views = sample_views(azimuth_step=15, elevations=[0, 20, 40, 60])
     return Registrar(ViewBank.build(example_mesh(), views, image_size=96, progress=False))
 
 
 @cache
-def scene(seed: int) -> tuple[Tensor, Tensor, Tensor]:
+def scene(seed):
     """image (3, H, W), box (4,), true T_cam_from_model (4, 4)."""
     generator = torch.Generator().manual_seed(seed)
     T = random_pose(example_mesh(), CAMERA, SIZE, generator, elevations=(5.0, 50.0))
@@ -43,13 +40,13 @@ def scene(seed: int) -> tuple[Tensor, Tensor, Tensor]:
     return image, box, T
 
 
-def errors(result: Any, T: Tensor) -> tuple[float, float]:
+def errors(result, T):
     """Degrees, and the error of the position as a fraction of the distance."""
     away = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
     return float(rotation_error(result.rotation, T[:3, :3])), away
 
 
-def sequence(count: int) -> list[tuple[Tensor, Tensor, Tensor]]:
+def sequence(count):
     """Photographs, boxes and poses: 4 degrees about a vertical axis and 2 % nearer from frame to
     frame."""
     T = scene(0)[2]
@@ -64,17 +61,17 @@ def sequence(count: int) -> list[tuple[Tensor, Tensor, Tensor]]:
     return frames
 
 
-def unrefined(bank: ViewBank, **changes: Any) -> Pipeline:
+def unrefined(bank, **changes):
     """The bank's pipeline without search and contour fit: results are views of the bank."""
     return replace(bank.pipeline, search=False, contours=False, **changes)
 
 
-def truck_registrar(**changes: Any) -> Registrar:
+def truck_registrar(**changes):
     """A registrar of the truck, with changed fields of its pipeline."""
     return Registrar(truck_bank(), pipeline=replace(truck_bank().pipeline, **changes))
 
 
-def write_photo(path: Path, image: Tensor) -> None:
+def write_photo(path, image):
     """Write a photograph (3, H, W) in [0, 1]."""
     assert cv2.imwrite(str(path), (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy())
 

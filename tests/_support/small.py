@@ -35,7 +35,7 @@ def rows_of(benchmark, out):
     return {entry.key: rows[entry.key] for entry in benchmark.entries if entry.key in rows}
 
 
-def kill_in_write(count: int) -> None:
+def kill_in_write(count):
     """Kill this process in its ``count``-th write of a file that is neither a bank nor a
     picture."""
     sync = os.fsync
@@ -53,7 +53,7 @@ def kill_in_write(count: int) -> None:
     os.fsync = sync_or_die
 
 
-def kill_a_worker(marker: Path) -> None:
+def kill_a_worker(marker):
     """Kill this process, a worker, when it gets photographs, unless another one did so."""
     register = runner._register_block
 

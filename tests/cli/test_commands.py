@@ -37,7 +37,7 @@ def test_the_process_seldom_looks_for_cycles(monkeypatch):
         gc.set_threshold(*usual)
 
 
-def end_of(outcome: str) -> tuple[int, list[str]]:
+def end_of(outcome):
     """Exit code and output of a process whose command ends with ``outcome``."""
     code = f"""
 import atexit, sys

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 
-def test_libraries_are_loaded_whole_and_their_objects_are_no_longer_searched_for_cycles() -> None:
+def test_libraries_are_loaded_whole_and_their_objects_are_no_longer_searched_for_cycles():
     code = """
 import gc
 from curvireg_torch.cli.libraries import load_libraries
@@ -30,7 +30,7 @@ print(len(trimesh.creation.box().vertex_adjacency_graph))
         *(pytest.param(m, marks=pytest.mark.slow) for m in ("torch._C", "trimesh")),
     ],
 )
-def test_ctrl_c_while_libraries_are_loaded_interrupts_the_command(module: str) -> None:
+def test_ctrl_c_while_libraries_are_loaded_interrupts_the_command(module):
     """Not each library survives an exception in its import: numpy recurses without end."""
     code = f"""
 import signal, sys
@@ -57,7 +57,7 @@ except KeyboardInterrupt:
     assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted True\n", "")
 
 
-def test_a_command_computes_small_products_on_one_thread() -> None:
+def test_a_command_computes_small_products_on_one_thread():
     code = """
 import os
 from curvireg_torch.cli.libraries import load_libraries

@@ -50,7 +50,7 @@ def resolve(dotted):
     # attributes first: a function may have the name of its module
     for count in range(1, len(names) + 1):
         try:
-            found: object = import_module(".".join(names[:count]))
+            found = import_module(".".join(names[:count]))
         except ImportError:
             return None
         for name in names[count:]:

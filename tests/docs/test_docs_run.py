@@ -7,7 +7,6 @@ import runpy
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
 
 import cv2
 import pytest
@@ -175,7 +174,7 @@ def test_commands_of_a_page_have_the_options_and_blocks_of_python_are_python(
     ids=lambda p: str(p.relative_to(ROOT)),
 )
 def test_page_runs(page, monkeypatch, capsys):
-    names: dict[str, Any] = {"__name__": "page"}
+    names = {"__name__": "page"}
     for kind, text in steps(page):
         if kind == "python":
             exec(compile(text, page.name, "exec"), names)
@@ -208,7 +207,7 @@ def test_the_first_pages_run_on_the_files_of_the_demo_alone(
     """Typed as they stand, in a folder that holds nothing else."""
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
     monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {"__name__": "page"}
+    names = {"__name__": "page"}
     registered = 0
     for kind, text in steps(page):
         if kind == "python":

@@ -47,7 +47,7 @@ def test_notebooks_run(source, monkeypatch, capsys):
     pyplot.switch_backend("agg")
     shown = []
     monkeypatch.setattr(pyplot, "show", lambda: shown.append(pyplot.gcf()))
-    namespace: dict[str, object] = {"__name__": "__main__"}
+    namespace = {"__name__": "__main__"}
     for number, cell in enumerate(cells(source)):
         if cell["cell_type"] == "code":
             code = compile("".join(cell["source"]), f"cell {number}", "exec")

@@ -2,7 +2,6 @@
 input is refused."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -201,7 +200,7 @@ def test_pose_errors_contract(error):
             error(est, gt, points)
 
 
-WRONG: dict[str, Callable[[], object]] = {
+WRONG = {
     "R_est: expected": lambda: metrics.symmetric_rotation_error(R[0, 0], R, SYMMETRIES),
     "R_gt: expected": lambda: metrics.symmetric_rotation_error(R, R.tolist(), SYMMETRIES),  # type: ignore[arg-type]
     "R_gt: expected finite": lambda: metrics.symmetric_rotation_error(R, R * math.nan, SYMMETRIES),

@@ -2,43 +2,40 @@
 contract."""
 
 import torch
-from torch import Tensor
 
 from curvireg_torch import features, filters
 
 from .._support.layer_contract import LayerCase
 
 
-def grid(size: int, *, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+def grid(size, *, dtype=torch.float64):
     """Pixel coordinates x, y relative to the centre of a (size, size) image, size odd."""
     axis = torch.arange(size, dtype=dtype) - (size - 1) / 2
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     return x, y
 
 
-def _front_of(squared: Tensor, distance: float) -> Tensor:
+def _front_of(squared, distance):
     return torch.where(squared > 0, distance - squared.clamp(min=0).sqrt(), 0.0)[None, None]
 
 
-def sphere(size: int, radius: float, distance: float) -> Tensor:
+def sphere(size, radius, distance):
     """Depth in px of the near side of a sphere, 0 outside it."""
     x, y = grid(size)
     return _front_of(radius**2 - x**2 - y**2, distance)
 
 
-def cylinder(size: int, radius: float, distance: float) -> Tensor:
+def cylinder(size, radius, distance):
     """Depth in px of the near side of a cylinder along y, 0 outside it."""
     return _front_of(radius**2 - grid(size)[0] ** 2, distance)
 
 
-def plane(size: int, slope_x: float, slope_y: float, distance: float) -> Tensor:
+def plane(size, slope_x, slope_y, distance):
     x, y = grid(size)
     return (distance + slope_x * x + slope_y * y)[None, None]
 
 
-def depths(
-    n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32
-) -> Tensor:
+def depths(n=2, size=24, *, seed=0, dtype=torch.float32):
     """Rough surfaces inside a disc, background 0."""
     generator = torch.Generator().manual_seed(seed)
     z = 2.0 + torch.rand(n, 1, size, size, generator=generator, dtype=torch.float64)
@@ -47,9 +44,7 @@ def depths(
     return torch.where(x**2 + y**2 < (0.4 * size) ** 2, z, 0.0).to(dtype)
 
 
-def photos(
-    n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32
-) -> Tensor:
+def photos(n=2, size=24, *, seed=0, dtype=torch.float32):
     """Smooth noise with a bright box, in [0, 1]."""
     generator = torch.Generator().manual_seed(seed)
     x = filters.gaussian_smooth(
@@ -59,16 +54,12 @@ def photos(
     return (x / x.amax(dim=(1, 2, 3), keepdim=True)).to(dtype)
 
 
-def colour_photos(
-    n: int = 1, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32
-) -> Tensor:
+def colour_photos(n=1, size=24, *, seed=0, dtype=torch.float32):
     """(n, 3, size, size) in [0, 1]."""
     return torch.cat([photos(n, size, seed=seed + i, dtype=dtype) for i in range(3)], dim=1)
 
 
-def fields(
-    n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32
-) -> Tensor:
+def fields(n=2, size=24, *, seed=0, dtype=torch.float32):
     return filters.image_gradient(photos(n, size, seed=seed, dtype=torch.float64)).to(dtype)
 
 
@@ -88,7 +79,7 @@ PAIRS = {
     "pci": (filters.principal_curvature_image, photos, filters.PrincipalCurvatureImage),
     "hog": (features.hog, fields, features.HOG),
 }
-OPTIONS: dict[str, dict[str, object]] = {
+OPTIONS = {
     **{name: {} for name in PAIRS},
     "cs-paper": {"formula": "paper"},
     "cs-paper-length": {"formula": "paper-length"},
@@ -102,7 +93,7 @@ OPTIONS: dict[str, dict[str, object]] = {
 }
 
 
-def _case(name: str, options: dict[str, object]) -> LayerCase:
+def _case(name, options):
     kind = name.partition("-")[0]
     return LayerCase(
         name,
@@ -118,6 +109,6 @@ def _case(name: str, options: dict[str, object]) -> LayerCase:
 LAYERS = {name: _case(name, options) for name, options in OPTIONS.items()}
 
 
-def equal_up_to_sign(a: Tensor, b: Tensor, *, atol: float) -> bool:
+def equal_up_to_sign(a, b, *, atol):
     """Whether the vectors of two fields (B, 2, H, W) agree, each up to its sign."""
     return bool((torch.minimum((a - b).abs().amax(1), (a + b).abs().amax(1)) <= atol).all())

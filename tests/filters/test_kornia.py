@@ -1,12 +1,8 @@
 """Filters are kornia's, and sums of shifted images in graphs: both give the same."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import kornia
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch import filters
 from curvireg_torch.filters import operations as ops
@@ -15,7 +11,7 @@ from scripts.speed import kornia_layers as script
 from scripts.speed.kornia_layers import LAYERS, LIMIT, computed, image_of, table
 
 
-def smoothed(sigma: float | Tensor, **options: object) -> Callable[[Tensor], Tensor]:
+def smoothed(sigma, **options):
     return lambda x: ops.smooth(x, sigma, **options)
 
 
@@ -33,9 +29,7 @@ PRIMITIVES = {
 @pytest.mark.parametrize("name", list(PRIMITIVES))
 @pytest.mark.parametrize("shape", [(2, 3, 17, 40), (1, 1, 5, 3)])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_both_give_the_same_with_the_same_derivatives(
-    name: str, shape: tuple[int, ...], dtype: torch.dtype
-) -> None:
+def test_both_give_the_same_with_the_same_derivatives(name, shape, dtype):
     x = torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=dtype)
     found = []
     for by_kornia in (False, True):
@@ -50,7 +44,7 @@ def test_both_give_the_same_with_the_same_derivatives(
 
 
 @pytest.mark.parametrize("name", list(LAYERS))
-def test_layers_are_the_same_by_both(name: str) -> None:
+def test_layers_are_the_same_by_both(name):
     image = image_of(48)
     fields = []
     for by_kornia in (False, True):
@@ -64,12 +58,12 @@ def test_layers_are_the_same_by_both(name: str) -> None:
     assert float(large.float().mean()) < 0.002
 
 
-def kornia_calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def kornia_calls(monkeypatch):
     """Names of the functions of kornia that are called from now on."""
-    calls: list[str] = []
+    calls = []
     own = kornia.filters.gaussian_blur2d
 
-    def counted(*args: object, **options: object) -> Tensor:
+    def counted(*args, **options):
         calls.append("gaussian_blur2d")
         return own(*args, **options)
 
@@ -77,7 +71,7 @@ def kornia_calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return calls
 
 
-def test_filters_call_kornia_and_graphs_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_filters_call_kornia_and_graphs_do_not(monkeypatch):
     calls = kornia_calls(monkeypatch)
     x = torch.rand(1, 1, 16, 16)
     field = filters.image_gradient(x)
@@ -91,7 +85,7 @@ def test_filters_call_kornia_and_graphs_do_not(monkeypatch: pytest.MonkeyPatch) 
     assert not calls
 
 
-def test_kornia_is_not_called_where_gradients_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kornia_is_not_called_where_gradients_are_wanted(monkeypatch):
     """On a CPU: convolutions of one channel have slow gradients."""
     calls = kornia_calls(monkeypatch)
     x = torch.rand(1, 1, 16, 16)
@@ -106,7 +100,7 @@ def test_kornia_is_not_called_where_gradients_are_wanted(monkeypatch: pytest.Mon
     assert calls == ["gaussian_blur2d"]
 
 
-def test_grey_levels_are_those_of_kornia_in_graphs_too() -> None:
+def test_grey_levels_are_those_of_kornia_in_graphs_too():
     x = torch.rand(2, 3, 8, 9)
     assert torch.equal(ops.to_grey(x), kornia.color.rgb_to_grayscale(x))
     assert ops.to_grey(x[:, :1]) is not None
@@ -116,7 +110,7 @@ def test_grey_levels_are_those_of_kornia_in_graphs_too() -> None:
     torch.testing.assert_close(torch.func.vmap(ops.to_grey)(x[None]), ops.to_grey(x)[None])
 
 
-def test_the_page_shows_the_record_which_is_within_the_limits() -> None:
+def test_the_page_shows_the_record_which_is_within_the_limits():
     layers = read_json(script.OUT)["layers"]
     page = script.PAGE.read_text(encoding="utf-8")
     assert layers
@@ -126,9 +120,7 @@ def test_the_page_shows_the_record_which_is_within_the_limits() -> None:
             assert run not in entry or entry[run]["ratio"] <= LIMIT
 
 
-def test_measurements_run_and_those_not_repeated_stay(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_measurements_run_and_those_not_repeated_stay(tmp_path, monkeypatch):
     out = tmp_path / "record.json"
     words = ["script", "--rounds", "1", "--seconds", "0.0001", "--size", "32", "--out", str(out)]
     for name in ("ImageCurvilinearSaliency", "ImageGradient"):

@@ -15,7 +15,7 @@ from curvireg_torch.errors import InvalidInputError
 
 from .layer_cases import CAMERA, PAIRS, depths, photos
 
-WRONG: list[tuple[str, dict[str, object], str]] = [
+WRONG = [
     ("cs", {"sigma": -1.0}, "sigma: expected a finite number >= 0, got -1"),
     (
         "cs",
@@ -122,7 +122,7 @@ def test_learnable_modules_start_at_their_options_with_correct_gradients(name):
         setattr(module, option, torch.tensor(getattr(fixed, option), dtype=torch.float64))
     torch.testing.assert_close(module(x), fixed(x), rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(copy.deepcopy(module)(x), module(x), rtol=0.0, atol=0.0)
-    weights: float | torch.Tensor = 1.0
+    weights = 1.0
     if name.startswith("mcs"):
         weights = fixed(x).norm(dim=1, keepdim=True) < 1.0 - 1e-6  # all levels are tied at the peak
 

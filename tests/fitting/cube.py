@@ -1,15 +1,12 @@
 """A cube in front of a camera, shared by the tests of fits."""
 
-from typing import Any
-
 import torch
 import trimesh
-from torch import Tensor
 
 from curvireg_torch import camera_matrix
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
-from curvireg_torch.registration import ContourFit, fit_contours
+from curvireg_torch.registration import fit_contours
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 
@@ -17,11 +14,11 @@ K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)
 BOX = torch.tensor([40.0, 36, 88, 84])
 
 
-def cube() -> trimesh.Trimesh:
+def cube():
     return trimesh.creation.box((1.0, 1.4, 0.8))
 
 
-def pose(axis_angle: list[float], position: list[float]) -> Tensor:
+def pose(axis_angle, position):
     """(4, 4) of a rotation in rad and a position."""
     R = rotation_from_axis_angle(torch.tensor(axis_angle, dtype=torch.float64))
     return transform(R, torch.tensor(position, dtype=torch.float64))
@@ -30,18 +27,16 @@ def pose(axis_angle: list[float], position: list[float]) -> Tensor:
 CUBE_POSE = pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])
 
 
-def silhouette(mesh: trimesh.Trimesh, T: Tensor) -> Tensor:
+def silhouette(mesh, T):
     """(1, 128, 128) white object on black."""
     return (make_renderer(mesh).render(T[None], K, (128, 128))[0] > 0).float()
 
 
-def noise() -> Tensor:
+def noise():
     return torch.rand(3, 128, 128, generator=torch.Generator().manual_seed(0))
 
 
-def fitted(
-    image: Tensor, starts: Tensor, *, mesh: trimesh.Trimesh | None = None, **options: Any
-) -> ContourFit:
+def fitted(image, starts, *, mesh=None, **options):
     """Fit a mesh, by default the cube, to a photograph that shows it in ``BOX``."""
     return fit_contours(
         MeshContours(mesh or cube()), image, options.pop("box", BOX), K, starts, **options

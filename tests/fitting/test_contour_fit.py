@@ -1,7 +1,6 @@
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -45,8 +44,8 @@ class ParabolicEdges:
 
 
 def problem(distances, heights):
-    contours: Any = SimpleNamespace(centre=CENTRE, radius=1.0)
-    edges: Any = ParabolicEdges(distances, heights)
+    contours = SimpleNamespace(centre=CENTRE, radius=1.0)
+    edges = ParabolicEdges(distances, heights)
     return ContourProblem(contours, edges, FIRST, K[None], 128)
 
 
@@ -213,7 +212,7 @@ def test_mask_weights_steps_and_comparison_and_not_the_reported_support():
     wrong = torch.arange(120) % 3 > 0
     plain = problem(torch.where(wrong, 3.0, 0.0).double()[None], [0.6])
     weights = torch.where(wrong, 0.1, 1.5).double()[None]
-    mask: Any = SimpleNamespace(
+    mask = SimpleNamespace(
         weights=lambda *_: weights[..., None], largest_weights=lambda _: 2.0 * weights
     )
     weighted = replace(plain, mask=mask)

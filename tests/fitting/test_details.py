@@ -2,7 +2,6 @@
 
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -129,7 +128,7 @@ def closed_case(
     )
     monkeypatch.setattr(details.ContourProblem, "of", lambda *_: problem)
     monkeypatch.setattr(details, "pixels", lambda *_: uv)
-    nothing: Any = None
+    nothing = None
     T = torch.eye(4).double().repeat(2, 1, 1)
     scores, differ = details.compare_details(nothing, nothing, nothing, T, nothing)
     torch.testing.assert_close(scores, -scores.T)

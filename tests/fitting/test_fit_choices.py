@@ -1,7 +1,6 @@
 """Which of several fits counts: the one with the most support, by the weights of the mask."""
 
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -55,9 +54,9 @@ def test_the_weighted_support_decides_and_the_plain_one_is_reported(monkeypatch)
 
 def test_the_starts_with_the_most_weighted_support_go_on(monkeypatch):
     """By these weights the last ones."""
-    begun: list[Tensor] = []
-    went_on: list[Tensor] = []
-    refined: list[Tensor] = []
+    begun = []
+    went_on = []
+    refined = []
 
     def weigh(problem, state, plain):
         if problem.density == COARSE_DENSITY and not begun:
@@ -74,7 +73,7 @@ def test_the_starts_with_the_most_weighted_support_go_on(monkeypatch):
         return two_best(half, fits, supports, index)
 
     descend = ContourProblem.descend
-    first: list[Tensor] = []
+    first = []
 
     def descended(problem, state, radii):
         first.append(state.T)
@@ -126,9 +125,9 @@ class Half:
 def test_the_next_best_fit_is_another_pose(x, support, expected):
     T = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
     T[:, 0, 3] = torch.tensor(x, dtype=torch.float64)
-    points: Any = torch.zeros(4, 1)
+    points = torch.zeros(4, 1)
     fits = ContourState(T, T, points)
-    half: Any = Half()
+    half = Half()
     index = torch.zeros(1, dtype=torch.long)
     supports = torch.tensor([support], dtype=torch.float64)
     source, chosen = contour_fit._two_best(half, fits, supports, index)

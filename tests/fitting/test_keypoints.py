@@ -30,7 +30,7 @@ SIZE = (360, 480)
 K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
 
 
-def carton(seed: int = 0) -> trimesh.Trimesh:
+def carton(seed=0):
     """A box with coloured bars and dots on every side, which are all different."""
     random = np.random.default_rng(seed)
     picture = np.full((384, 384, 3), 225, np.uint8)
@@ -53,21 +53,21 @@ def carton(seed: int = 0) -> trimesh.Trimesh:
 
 
 @cache
-def mesh() -> trimesh.Trimesh:
+def mesh():
     return as_mesh(carton())
 
 
 @cache
-def keypoints() -> Keypoints:
+def keypoints():
     return Keypoints(ViewDescriber(mesh(), BankSettings()))
 
 
-def pose(azimuth: float, x: float, z: float) -> torch.Tensor:
+def pose(azimuth, x, z):
     R = rotation_from_viewpoint(azimuth, 25.0, 10.0).double()
     return transform(R, torch.tensor([x, 0.1, z], dtype=torch.float64))
 
 
-def photograph(*poses: torch.Tensor, shown: trimesh.Trimesh | None = None) -> torch.Tensor:
+def photograph(*poses, shown=None):
     """(3, H, W) meshes in dim light, in front of clutter."""
     image = procedural_background(SIZE, torch.Generator().manual_seed(3))
     for T in poses:
@@ -77,7 +77,7 @@ def photograph(*poses: torch.Tensor, shown: trimesh.Trimesh | None = None) -> to
     return (image + 0.02 * noise).clamp(0, 1)
 
 
-def box_of(T: torch.Tensor) -> torch.Tensor:
+def box_of(T):
     return projected_boxes(extreme_points(mesh()), T[None], K)[0].float()
 
 
@@ -229,7 +229,7 @@ def test_origin_of_the_mesh_may_be_far_away():
 
 
 @cache
-def registrar() -> cr.Registrar:
+def registrar():
     """Of views from far away directions."""
     return cr.Registrar(
         mesh(), views=cr.sample_views(azimuth_step=180, elevations=[-60]), mesh_is="exact"
@@ -294,7 +294,7 @@ def test_boxes_of_keypoints_are_the_first_proposals_less_certain_with_a_rival():
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.25, 0.5), (0.4, -0.3)])
-def test_features_lie_where_blobs_are(shift: tuple[float, float]) -> None:
+def test_features_lie_where_blobs_are(shift):
     """Gaussian blobs of known centres: OpenCV's default puts features 0.25 px too far right and
     down."""
     axis = torch.arange(256, dtype=torch.float64)
@@ -316,7 +316,7 @@ def test_features_lie_where_blobs_are(shift: tuple[float, float]) -> None:
     assert np.abs(np.median(nearest, axis=0)).max() < 0.03
 
 
-def test_keypoints_are_where_the_mesh_shows_them() -> None:
+def test_keypoints_are_where_the_mesh_shows_them():
     """Of several photographs: the median distance in px of matched features from their
     keypoints."""
     residuals = []

@@ -44,7 +44,7 @@ def plate(size, at):
     return box
 
 
-def hollow_box() -> trimesh.Trimesh:
+def hollow_box():
     """A box of 60 x 40 x 30 without a bottom, of which one half is solid: only from below is its
     sides' difference seen."""
     walls = [
@@ -59,7 +59,7 @@ def hollow_box() -> trimesh.Trimesh:
 
 
 @pytest.fixture(scope="module")
-def registrar(small_bank) -> Registrar:
+def registrar(small_bank):
     return Registrar(small_bank, mesh_is="exact")
 
 
@@ -308,7 +308,7 @@ def test_trial_counts_right_and_reliable_and_stages_are_reported_in_order(regist
         assert done[-1][0] == done[-1][1]
 
 
-def outcome(error: float, *, elevation: float = 0.0) -> Outcome:
+def outcome(error, *, elevation=0.0):
     photograph = GeneratedPhotograph(
         torch.zeros(3, 4, 4, dtype=torch.uint8),
         torch.tensor([0.0, 0, 200, 100]),
@@ -362,7 +362,7 @@ def test_symmetries_of_colours_are_told_from_those_of_shape():
     assert len(mesh_facts(label).symmetries) == 71
 
 
-def pair_of(rotation, rival, **more) -> LookAlike:
+def pair_of(rotation, rival, **more):
     return LookAlike(rotation, rival, 180.0, 0.9, 0.8, **more)
 
 

@@ -3,7 +3,6 @@
 import copy
 import pickle
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -108,7 +107,7 @@ def test_matcher_moves_bank_terms_and_networks(small_bank):
     assert {p.device.type for p in matcher.parameters()} == {"meta"}
     assert matcher.describer is not before
     empty = torch.zeros(1, 1, small_bank.descriptors.shape[1], device="meta")
-    query: Any = QueryFeatures(empty, empty, empty, empty, torch.zeros(1, device="meta"))
+    query = QueryFeatures(empty, empty, empty, empty, torch.zeros(1, device="meta"))
     for _, compare in matcher._terms:
         assert compare(query).device.type == "meta"
 
@@ -168,7 +167,7 @@ def test_hooks_of_the_field_run(small_bank):
     matcher = ViewMatcher(small_bank, field=field)
     image, box, _ = scene(0)
     plain = matcher.query(image[None], box[None])
-    calls: list[str] = []
+    calls = []
 
     def after(*arguments):
         calls.append("after")

@@ -12,10 +12,7 @@ def at(uv, corners=(255, 255, 255)):
     coordinates = np.tile(np.array(uv, np.float32), (1, 3, 1))
     colours = SurfaceColours(face, coordinates, np.zeros(1, np.int32), (TEXTURE,))
     third = np.full(1, 1.0 / 3.0, np.float32)
-    found: list[float] = (
-        255.0 * colours_at(colours, np.zeros(1, np.int32), third, third)[0]
-    ).tolist()
-    return found
+    return (255.0 * colours_at(colours, np.zeros(1, np.int32), third, third)[0]).tolist()
 
 
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (3, 4), (1, 2)])

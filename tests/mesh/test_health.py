@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,25 +23,22 @@ Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 SIDES = (60.0, 40.0, 30.0)
 
 
-def joined(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
-    whole: trimesh.Trimesh = trimesh.util.concatenate(list(meshes))
-    return whole
+def joined(*meshes):
+    return trimesh.util.concatenate(list(meshes))
 
 
-def triangle(size: float, at: tuple[float, float, float]) -> trimesh.Trimesh:
+def triangle(size, at):
     corners = np.array([[0, 0, 0], [size, 0, 0], [0, size, 0]]) + at
     return trimesh.Trimesh(corners, [[0, 1, 2]], process=False)
 
 
-def box(
-    at: tuple[float, float, float] = (0.0, 0.0, 0.0), sides: tuple[float, ...] = SIDES
-) -> trimesh.Trimesh:
+def box(at=(0.0, 0.0, 0.0), sides=SIDES):
     mesh = trimesh.creation.box(sides)
     mesh.apply_translation(at)
     return mesh
 
 
-def row_of_chips(axis: int) -> trimesh.Trimesh:
+def row_of_chips(axis):
     """A box, and a row of chips along an axis, 7 apart."""
     places = np.zeros((5, 3))
     places[:, axis] = 0.5 * SIDES[axis] + 7.0 * np.arange(1, 6)
@@ -53,7 +49,7 @@ def row_of_chips(axis: int) -> trimesh.Trimesh:
 @pytest.mark.parametrize(
     "at", [(300.0, 0.0, 0.0), (0.0, -120.0, 0.0), (0.0, 0.0, 1e6), (80.0, 80.0, 80.0)]
 )
-def test_left_over_parts_do_not_set_the_box(scale: float, at: tuple[float, float, float]) -> None:
+def test_left_over_parts_do_not_set_the_box(scale, at):
     whole = joined(triangle(1.0, at), box(), triangle(1.0, (at[0], at[1] + 3.0, at[2])))
     whole.apply_scale(scale)
     mesh = as_mesh(whole)
@@ -67,7 +63,7 @@ def test_left_over_parts_do_not_set_the_box(scale: float, at: tuple[float, float
     assert mesh_warnings(as_mesh(mesh)) == (warning,), "told once"
 
 
-def test_colours_stay_with_their_faces() -> None:
+def test_colours_stay_with_their_faces():
     whole = joined(triangle(1.0, (300.0, 0.0, 0.0)), box())
     colours = np.arange(39, dtype=np.uint8).reshape(13, 3) * 6
     whole.visual = trimesh.visual.ColorVisuals(whole, face_colors=colours)
@@ -106,13 +102,13 @@ def test_colours_stay_with_their_faces() -> None:
         "rod",
     ],
 )
-def test_parts_that_belong_to_the_object_stay(whole: trimesh.Trimesh) -> None:
+def test_parts_that_belong_to_the_object_stay(whole):
     assert not stray_faces(whole).any()
     mesh = as_mesh(whole)
     assert (len(mesh.faces), mesh_warnings(mesh)) == (len(whole.faces), ())
 
 
-def test_a_tiny_part_inside_the_box_stays() -> None:
+def test_a_tiny_part_inside_the_box_stays():
     ring = trimesh.creation.annulus(90.0, 100.0, 10.0)
     inside = triangle(1.0, (0.0, 0.0, 0.0))
     far = triangle(1.0, (0.0, 0.0, 900.0))
@@ -120,7 +116,7 @@ def test_a_tiny_part_inside_the_box_stays() -> None:
     assert len(mesh.faces) == len(ring.faces) + 1
 
 
-def test_the_warning_of_a_file_names_it(tmp_path: Path, load: Load) -> None:
+def test_the_warning_of_a_file_names_it(tmp_path, load):
     joined(box(), triangle(1.0, (300.0, 0.0, 0.0))).export(tmp_path / "scan.ply")
     mesh, (text,) = load(tmp_path / "scan.ply", unit="mm")
     assert text.startswith(f"{tmp_path / 'scan.ply'}: of 13 faces 1 near (300.3, 0.3333, 0)")
@@ -128,7 +124,7 @@ def test_the_warning_of_a_file_names_it(tmp_path: Path, load: Load) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply", "stl"])
-def test_coordinates_of_maps(tmp_path: Path, load: Load, suffix: str) -> None:
+def test_coordinates_of_maps(tmp_path, load, suffix):
     """Text keeps the digits, single precision does not, and says so."""
     offset = np.array([4.4e6, 5.1e5, 4.6e6])
     sphere = trimesh.creation.icosphere(3, 40.123)
@@ -148,13 +144,13 @@ def test_coordinates_of_maps(tmp_path: Path, load: Load, suffix: str) -> None:
     assert not load(tmp_path / f"b.{suffix}", unit="mm")[1]
 
 
-def coloured(**visual: object) -> trimesh.Trimesh:
+def coloured(**visual):
     mesh = trimesh.creation.cylinder(30.0, 100.0, sections=96)
     mesh.visual = trimesh.visual.ColorVisuals(mesh, **visual)
     return as_mesh(mesh)
 
 
-def test_colours_that_do_not_vary_are_none() -> None:
+def test_colours_that_do_not_vary_are_none():
     faces = len(trimesh.creation.cylinder(30.0, 100.0, sections=96).faces)
     for shade in (0, 100, 255):
         mesh = coloured(face_colors=np.full((faces, 3), shade, np.uint8))
@@ -168,7 +164,7 @@ def test_colours_that_do_not_vary_are_none() -> None:
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.0005, 0.01, 0.5])
-def test_a_texture_counts_if_a_word_of_it_differs(fraction: float) -> None:
+def test_a_texture_counts_if_a_word_of_it_differs(fraction):
     side = 400
     texture = np.full((side, side, 3), 200, np.uint8)
     width = round(side * fraction**0.5)
@@ -182,7 +178,7 @@ def test_a_texture_counts_if_a_word_of_it_differs(fraction: float) -> None:
     assert has_colours(mesh) == (fraction > 0.002)
 
 
-def test_notes_reach_the_result(tmp_path: Path) -> None:
+def test_notes_reach_the_result(tmp_path):
     scene = cr.synthetic.demo_scene()
     stray = triangle(0.001 * mesh_radius(scene.mesh), (9.0 * mesh_radius(scene.mesh), 0.0, 0.0))
     mesh = as_mesh(
@@ -202,7 +198,7 @@ def test_notes_reach_the_result(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_pose_of_a_mesh_far_from_its_origin() -> None:
+def test_the_pose_of_a_mesh_far_from_its_origin():
     """As with coordinates of maps, 7 km away from an object of 35 cm: the pose of the mesh near the
     origin, moved."""
     scene = cr.synthetic.demo_scene()
@@ -223,7 +219,7 @@ def test_the_pose_of_a_mesh_far_from_its_origin() -> None:
     np.testing.assert_allclose(far, near, atol=1e-6)
 
 
-def test_a_part_of_half_a_percent_is_no_leftover() -> None:
+def test_a_part_of_half_a_percent_is_no_leftover():
     parts = [trimesh.creation.box((1.0, 1.0, 1.0))]
     for side, place in ((0.07, 3.0), (0.02, -3.0)):
         part = trimesh.creation.box((side, side, side))

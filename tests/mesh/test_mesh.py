@@ -1,6 +1,5 @@
 import pickle
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from curvireg_torch.rendering.contours import MeshContours
 
 
 @pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (1.0, 0.9, 0.02), (1.0, 0.05, 0.05)])
-def test_extreme_points_of_a_large_hull_keep_the_boxes(scale: tuple[float, float, float]) -> None:
+def test_extreme_points_of_a_large_hull_keep_the_boxes(scale):
     mesh = trimesh.creation.icosphere(subdivisions=5)  # 10 242 vertices, all on the hull
     mesh.apply_scale(scale)
     points = extreme_points(mesh)
@@ -40,9 +39,7 @@ def test_extreme_points_of_a_large_hull_keep_the_boxes(scale: tuple[float, float
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_normalization_transform_is_invariant_to_similarities(
-    truck: trimesh.Trimesh, seed: int
-) -> None:
+def test_normalization_transform_is_invariant_to_similarities(truck, seed):
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3] = 7.0 * torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
     T[:3, 3] = torch.tensor([3.0, -2.0, 5.0])
@@ -62,7 +59,7 @@ def test_normalization_transform_is_invariant_to_similarities(
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_mesh_is_as_large_as_its_longest_side(axis: int) -> None:
+def test_a_mesh_is_as_large_as_its_longest_side(axis):
     sides = np.full(3, 5e-7)
     sides[axis] = 2e-6
     assert len(as_mesh(trimesh.creation.box(sides)).faces) == 12
@@ -73,7 +70,7 @@ def test_a_mesh_is_as_large_as_its_longest_side(axis: int) -> None:
 @pytest.mark.parametrize(
     ("suffix", "up"), [("glb", "y"), ("ply", "z"), ("stl", "z"), ("off", "z"), ("obj", "z")]
 )
-def test_load_mesh_notes_the_up_axis(tmp_path: Path, suffix: str, up: str) -> None:
+def test_load_mesh_notes_the_up_axis(tmp_path, suffix, up):
     path = tmp_path / f"a.{suffix}"
     trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
     mesh = cr.load_mesh(path)
@@ -84,7 +81,7 @@ def test_load_mesh_notes_the_up_axis(tmp_path: Path, suffix: str, up: str) -> No
         cr.load_mesh(path, up="w")
 
 
-def test_welding_joins_vertices_at_one_place_and_drops_faces_twice_or_without_area() -> None:
+def test_welding_joins_vertices_at_one_place_and_drops_faces_twice_or_without_area():
     box = trimesh.creation.box((1, 2, 3))
     apart = np.asarray(box.vertices)[box.faces].reshape(-1, 3) + 1e-8 * np.arange(36)[:, None]
     faces = np.arange(36).reshape(12, 3)
@@ -103,12 +100,12 @@ def test_welding_joins_vertices_at_one_place_and_drops_faces_twice_or_without_ar
     )
 
 
-def test_a_surface_encloses_volumes_where_each_edge_has_two_faces_of_one_orientation() -> None:
+def test_a_surface_encloses_volumes_where_each_edge_has_two_faces_of_one_orientation():
     box = trimesh.creation.box()
     corners = np.asarray(box.vertices)
     faces = np.asarray(box.faces)
 
-    def closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    def closed(vertices, faces):
         return encloses_volumes(trimesh.Trimesh(vertices, faces, process=False))
 
     assert closed(corners, faces)
@@ -138,7 +135,7 @@ def test_edges_of_one_vertex_are_neighbours():
     assert edges.tolist() == sorted(edges.tolist())
 
 
-def test_parts_smaller_than_what_is_welded_keep_their_edges() -> None:
+def test_parts_smaller_than_what_is_welded_keep_their_edges():
     corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=float)
     mesh = trimesh.Trimesh(
         np.concatenate([corner, corner + np.array([1e7, 0, 0])]),
@@ -159,7 +156,7 @@ def test_parts_smaller_than_what_is_welded_keep_their_edges() -> None:
     ("size", "warns"),
     [(99.0, False), (101.0, True), (900.0, True), (0.0051, False), (0.0049, True)],
 )
-def test_load_mesh_warns_of_the_size(tmp_path: Path, size: float, warns: bool) -> None:
+def test_load_mesh_warns_of_the_size(tmp_path, size, warns):
     trimesh.creation.box(np.full(3, size / 3**0.5)).export(tmp_path / "a.ply")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -170,7 +167,7 @@ def test_load_mesh_warns_of_the_size(tmp_path: Path, size: float, warns: bool) -
     assert [one.message.kind for one in caught] == ["unit"] * warns
 
 
-def test_places_of_parts_are_multiplied_from_the_root(tmp_path: Path) -> None:
+def test_places_of_parts_are_multiplied_from_the_root(tmp_path):
     """A part moved along x below a node that turns x to y: products in the other order put it
     elsewhere."""
     quarter = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1])
@@ -189,7 +186,7 @@ def test_places_of_parts_are_multiplied_from_the_root(tmp_path: Path) -> None:
     np.testing.assert_allclose(cr.load_mesh(tmp_path / "a.glb").bounds, expected, atol=1e-6)
 
 
-def test_a_degenerate_face_takes_no_colours_away(tmp_path: Path) -> None:
+def test_a_degenerate_face_takes_no_colours_away(tmp_path):
     points = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
     (tmp_path / "a.mtl").write_text("newmtl a\nKd 1 0 0\nnewmtl b\nKd 0 0 1\n")
     (tmp_path / "a.obj").write_text(
@@ -200,9 +197,7 @@ def test_a_degenerate_face_takes_no_colours_away(tmp_path: Path) -> None:
     assert mesh.metadata["colours"].corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
 
 
-def test_bytes_of_the_files_beside_a_mesh_are_bounded_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bytes_of_the_files_beside_a_mesh_are_bounded_together(tmp_path, monkeypatch):
     monkeypatch.setattr("curvireg_torch.formats.meshes.source.MAX_MESH_BYTES", 1000)
     names = [f"{k}.mtl" for k in range(3)]
     for name in names:

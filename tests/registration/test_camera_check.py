@@ -4,7 +4,6 @@ from functools import cache
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint, transform
 from curvireg_torch.mesh import mesh_centre, mesh_radius
@@ -17,12 +16,12 @@ SIZE = (360, 480)
 FOCAL = 400.0
 
 
-def camera(factor: float) -> Tensor:
+def camera(factor):
     return camera_matrix(factor * FOCAL, factor * FOCAL, 239.5, 179.5, dtype=torch.float64)
 
 
 @cache
-def near_photograph() -> tuple[Tensor, Tensor]:
+def near_photograph():
     """(3, H, W) and its box (4,): seen from nearby, so that perspective is strong."""
     mesh = example_mesh()
     R = rotation_from_viewpoint(40.0, 25.0, 0.0).double()
@@ -64,7 +63,7 @@ def test_focal_lengths_of_several_photographs_are_compared_at_once(monkeypatch):
 
 
 def test_contradictions_need_a_clear_focal_length_two_deviations_and_a_distance_that_matters():
-    def named(gap: float, deviation: float, given: float = 0.0) -> bool:
+    def named(gap, deviation, given=0.0):
         return focal_contradiction(500.0, gap, deviation, given_deviation=given) is not None
 
     assert named(0.21, 0.1)

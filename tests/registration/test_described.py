@@ -2,11 +2,9 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch import Pipeline
 from curvireg_torch.geometry.framing import CropFrame, photograph_box
@@ -17,7 +15,7 @@ from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene
 
 
-def frame_of(target: Any, box: Tensor) -> CropFrame:
+def frame_of(target, box):
     settings = target.bank.settings
     shown = photograph_box(SIZE)
     return CropFrame.of(box, shown, side=settings.image_size, margin=settings.margin)

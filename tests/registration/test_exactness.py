@@ -19,7 +19,7 @@ COVARIANCE = torch.diag(torch.tensor([0.02, 0.05, 0.03, 1.0, 2.0, 8.0]).double()
 CENTRE = torch.tensor([20.0, -30.0, 10.0], dtype=torch.float64)
 
 
-def pose() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, float]:
+def pose():
     """Rotation, translation, allocentric rotation and distance, in mm."""
     R = rotation_from_viewpoint(30.0, 20.0, 5.0).double()
     t = torch.tensor([80.0, -40.0, 600.0], dtype=torch.float64)

@@ -23,7 +23,7 @@ SQUARE = torch.from_numpy(trimesh.creation.box((1.0, 1.0, 0.001)).vertices.copy(
 K = camera_matrix(100.0, 100.0, 49.5, 39.5, dtype=torch.float64)
 
 
-def at(x: float, y: float, z: float) -> torch.Tensor:
+def at(x, y, z):
     T = torch.eye(4, dtype=torch.float64)
     T[:3, 3] = torch.tensor([x, y, z])
     return T

@@ -5,9 +5,8 @@ from functools import cache
 
 import pytest
 import torch
-from torch import Tensor
 
-from curvireg_torch import Registrar, Registration, ViewBank, sample_views
+from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.mesh.round_axis import RoundAxis
 from curvireg_torch.registration.confidence import probability_of_any, shares
@@ -36,11 +35,11 @@ FEATURES = {
 UPRIGHT = RoundAxis(torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double(), False)
 
 
-def turned(*viewpoints: tuple[float, float]) -> Tensor:
+def turned(*viewpoints):
     return torch.stack([rotation_from_viewpoint(a, e, 0.0).double() for a, e in viewpoints])
 
 
-def rivals_of(*viewpoints: tuple[float, float], scores: list[float]) -> Rivals:
+def rivals_of(*viewpoints, scores):
     values = torch.tensor(scores).double()
     views = turned((0.0, 20.0), (90.0, 20.0), (180.0, 20.0), (0.0, -70.0)).float()
     ranked = torch.tensor([1.0, 0.9, 0.95, 0.8])
@@ -48,7 +47,7 @@ def rivals_of(*viewpoints: tuple[float, float], scores: list[float]) -> Rivals:
 
 
 @cache
-def of_canister() -> tuple[Registrar, Registration, tuple[Tensor, Tensor, Tensor]]:
+def of_canister():
     """Seen from where the turn is hard to tell."""
     views = sample_views(azimuth_step=15, elevations=[-50, -25, 0, 25, 50])
     registrar = Registrar(ViewBank.build(canister(), views, image_size=96, progress=False))

@@ -10,7 +10,7 @@ from curvireg_torch.registration.hypotheses import Hypotheses
 WEIGHTS = EvidenceWeights.only(similarity=10.0)
 
 
-def hypotheses(*similarity: float) -> Hypotheses:
+def hypotheses(*similarity):
     count = len(similarity)
     T = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
     T[:, 2, 3] = 5.0
@@ -20,7 +20,7 @@ def hypotheses(*similarity: float) -> Hypotheses:
     return replace(poses, evidence=of_similarity(*similarity))
 
 
-def of_similarity(*similarity: float) -> Evidence:
+def of_similarity(*similarity):
     return replace(
         Evidence.zeros(len(similarity)), similarity=torch.tensor(similarity, dtype=torch.float64)
     )

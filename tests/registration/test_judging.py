@@ -2,11 +2,9 @@
 
 from dataclasses import fields, replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
@@ -14,7 +12,6 @@ from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import judged
-from curvireg_torch.registration.result import Registration
 from tests._support.scenes import CAMERA, SIZE
 
 HULL = 0.3 * torch.tensor(
@@ -24,12 +21,12 @@ BOX = torch.tensor([90.0, 60.0, 150.0, 120.0])
 HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
 
 
-def turned(*degrees: float) -> Tensor:
+def turned(*degrees):
     """(N, 3, 3) rotations of views about the vertical axis."""
     return torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in degrees])
 
 
-def poses_at(*degrees: float, x: float = 0.0) -> Hypotheses:
+def poses_at(*degrees, x=0.0):
     R = turned(*degrees)
     H = len(R)
     T = transform(R, torch.tensor([x, 0.0, 5.0]).double().expand(H, 3))
@@ -37,7 +34,7 @@ def poses_at(*degrees: float, x: float = 0.0) -> Hypotheses:
     return Hypotheses.at(T, CAMERA.expand(H, 3, 3), torch.zeros(3).double(), torch.arange(H), rank)
 
 
-def evidence_of(**columns: list[float]) -> Evidence:
+def evidence_of(**columns):
     H = len(next(iter(columns.values())))
     values = {field.name: torch.zeros(H, dtype=torch.float64) for field in fields(Evidence)}
     given = {name: torch.tensor(column, dtype=torch.float64) for name, column in columns.items()}
@@ -47,29 +44,27 @@ def evidence_of(**columns: list[float]) -> Evidence:
 class Limits:
     """Limits that remember what they are asked."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.asked: list[tuple[Hypotheses, bool]] = []
 
-    def contradiction(
-        self, best: Hypotheses, filling: Hypotheses, *, better_outside: bool
-    ) -> str | None:
+    def contradiction(self, best, filling, *, better_outside):
         self.asked.append((best, better_outside))
         return "better outside" if better_outside else None
 
 
 def judgement(
-    poses: Hypotheses,
-    evidence: Evidence,
+    poses,
+    evidence,
     *,
-    distinct: list[bool] | None = None,
-    outside: list[bool] | None = None,
-    pipeline: Pipeline | None = None,
-    scores: list[float] | None = None,
-    printed: float = 0.0,
-    **changes: Any,
-) -> Registration:
+    distinct=None,
+    outside=None,
+    pipeline=None,
+    scores=None,
+    printed=0.0,
+    **changes,
+):
     H = len(poses)
-    target: Any = SimpleNamespace(
+    target = SimpleNamespace(
         score_weights=lambda **_: EvidenceWeights(),
         pipeline=pipeline or Pipeline(),
         bank=SimpleNamespace(views=SimpleNamespace(rotations=turned(0.0, 90.0, 180.0).float())),
@@ -91,7 +86,7 @@ def judgement(
     limits = changes.pop("limits", None)
     symmetries = changes.pop("symmetries", None)
     vars(item).update(changes)
-    block: Any = SimpleNamespace(
+    block = SimpleNamespace(
         exact=True,
         photographs=[item],
         rankings=[ranking],
@@ -107,7 +102,7 @@ def judgement(
     return judged(target, block, 0, poses)
 
 
-def order_of(result: Registration) -> list[int]:
+def order_of(result):
     return [hypothesis.view for hypothesis in result.hypotheses]
 
 

@@ -12,7 +12,7 @@ from tests._support.poses import poses as random_poses
 from tests._support.scenes import CAMERA, learned_registrar, scene
 
 
-def chiral_mesh() -> trimesh.Trimesh:
+def chiral_mesh():
     parts = [
         trimesh.creation.box((1.0, 0.6, 0.4)),
         trimesh.creation.box((0.3, 0.3, 0.5)).apply_translation((0.5, 0.2, 0.3)),
@@ -21,7 +21,7 @@ def chiral_mesh() -> trimesh.Trimesh:
     return trimesh.util.concatenate(parts)
 
 
-def placed_at(T: torch.Tensor, mesh: trimesh.Trimesh) -> Hypotheses:
+def placed_at(T, mesh):
     nothing = torch.zeros(len(T))
     cameras = CAMERA.expand(len(T), 3, 3)
     return Hypotheses.at(T, cameras, mesh_centre(mesh), nothing.long(), nothing.double())

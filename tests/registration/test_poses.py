@@ -5,7 +5,6 @@ from dataclasses import fields
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.matching import Ranking
@@ -13,12 +12,12 @@ from curvireg_torch.registration.hypotheses import Hypotheses, best_views, disti
 from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
 
 
-def rotation(x: float, y: float, z: float) -> Tensor:
+def rotation(x, y, z):
     """(3, 3) of an axis-angle vector in degrees."""
     return rotation_from_axis_angle(torch.deg2rad(torch.tensor([x, y, z], dtype=torch.float64)))
 
 
-def poses(degrees: list[float]) -> Hypotheses:
+def poses(degrees):
     """Poses that differ by rotations about one axis."""
     number = torch.arange(len(degrees))
     R = torch.stack([rotation(0.0, angle, 0.0) for angle in degrees])

@@ -70,7 +70,7 @@ def test_limits_hold_in_the_camera_of_the_photograph():
     assert bool(allowed[distances < 7.5].all())
 
 
-def pose_at(away=1.5, degrees=0.0) -> Hypotheses:
+def pose_at(away=1.5, degrees=0.0):
     """A pose whose centre is so far away, off the optical axis, rotated about the axis."""
     describer = truck_registrar().describer
     index = torch.zeros(1, dtype=torch.long)

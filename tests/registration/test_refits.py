@@ -2,11 +2,9 @@
 
 from dataclasses import fields, replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
@@ -18,7 +16,7 @@ from tests._support.scenes import CAMERA
 MOVE = 1e-3
 
 
-def poses_at(*degrees: float) -> Hypotheses:
+def poses_at(*degrees):
     """Of the views 0, 1, ..., turned about the vertical axis."""
     R = torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in degrees])
     H = len(R)
@@ -27,7 +25,7 @@ def poses_at(*degrees: float) -> Hypotheses:
     return Hypotheses.at(T, CAMERA.expand(H, 3, 3), torch.zeros(3).double(), torch.arange(H), rank)
 
 
-def evidence_of(*similarity: float) -> Evidence:
+def evidence_of(*similarity):
     nothing = torch.zeros(len(similarity), dtype=torch.float64)
     values = Evidence(*[nothing] * len(fields(Evidence)))
     return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64))
@@ -37,7 +35,7 @@ class Refits:
     """Fits that move poses to the right by ``MOVE``, where they have a ``new`` similarity by their
     view; which were fitted, and which were compared in detail."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, new: dict[int, float]) -> None:
+    def __init__(self, monkeypatch, new):
         self.new = new
         self.fitted: list[list[int]] = []
         self.compared: list[tuple[int, list[int]]] = []
@@ -45,9 +43,7 @@ class Refits:
         monkeypatch.setattr(stages, "with_evidence", self.measure)
         monkeypatch.setattr(stages, "with_details", self.compare)
 
-    def fit(
-        self, target: Any, block: Any, crops: Any, starts: Hypotheses, *, refit: bool
-    ) -> Hypotheses:
+    def fit(self, target, block, crops, starts, *, refit):
         assert refit
         self.fitted.append(starts.view.tolist())
         T = starts.T.clone()
@@ -55,13 +51,11 @@ class Refits:
         T[moves, 0, 3] += MOVE
         return replace(starts, T=T)
 
-    def measure(self, target: Any, block: Any, poses: Hypotheses) -> Hypotheses:
+    def measure(self, target, block, poses):
         new = evidence_of(*[self.new.get(view, 1.0) for view in poses.view.tolist()])
         return replace(poses, evidence=new)
 
-    def compare(
-        self, target: Any, crops: Any, poses: Hypotheses, best: Tensor, rivals: Tensor
-    ) -> Hypotheses:
+    def compare(self, target, crops, poses, best, rivals):
         self.compared.append((int(best), rivals.tolist()))
         evidence = poses.evidence
         details = torch.ones_like(evidence.details)
@@ -69,19 +63,17 @@ class Refits:
 
     def run(
         self,
-        poses: Hypotheses,
-        evidence: Evidence,
-        outside: list[bool] | None = None,
-        symmetries: Tensor | None = None,
-    ) -> tuple[list[bool], Evidence]:
+        poses,
+        evidence,
+        outside=None,
+        symmetries=None,
+    ):
         """Which poses moved, and the evidence."""
-        target: Any = SimpleNamespace(
-            score_weights=lambda **_: EvidenceWeights(), pipeline=Pipeline()
-        )
-        block: Any = SimpleNamespace(
+        target = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), pipeline=Pipeline())
+        block = SimpleNamespace(
             symmetries=symmetries, keeps=lambda poses: torch.ones(len(poses), dtype=torch.bool)
         )
-        crops: Any = None
+        crops = None
         excluded = torch.tensor(outside or [False] * len(poses))
         before = replace(poses, evidence=evidence, is_outside=excluded)
         after = stages.refitted(target, block, crops, before)

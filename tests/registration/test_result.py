@@ -66,7 +66,7 @@ def test_the_confidence_is_shown_rounded_down():
     assert "confidence 0.89" in repr(registration(confidence=0.897))
 
 
-def turned(*degrees: float, elevation: float = 0.0) -> torch.Tensor:
+def turned(*degrees, elevation=0.0):
     return torch.stack([rotation_from_viewpoint(d, elevation, 0.0).double() for d in degrees])
 
 

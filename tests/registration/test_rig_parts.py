@@ -4,11 +4,9 @@ pose."""
 import math
 from dataclasses import fields, replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evidence import Evidence
@@ -24,7 +22,7 @@ RADIUS = 2.0
 ORIGIN = torch.eye(4, dtype=torch.float64)
 
 
-def turned(*degrees: float, shift: float = 0.0) -> Tensor:
+def turned(*degrees, shift=0.0):
     """(N, 4, 4) world poses about the z axis through the object's centre."""
     angles = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
     R = rotation_from_axis_angle(angles[:, None] * torch.tensor([0.0, 0.0, 1.0]).double())
@@ -32,7 +30,7 @@ def turned(*degrees: float, shift: float = 0.0) -> Tensor:
     return transform(R, moved - (R @ CENTRE))
 
 
-def rig_of(eyes: Tensor, **attributes: Any) -> Rig:
+def rig_of(eyes, **attributes):
     """A rig of cameras at ``eyes`` (V, 3), relative to the object's centre."""
     rig = object.__new__(Rig)
     rig.eyes = eyes + CENTRE
@@ -44,7 +42,7 @@ def rig_of(eyes: Tensor, **attributes: Any) -> Rig:
     return rig
 
 
-def around(*degrees: float, distance: float = 10.0) -> Tensor:
+def around(*degrees, distance=10.0):
     angles = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
     return distance * torch.stack([angles.cos(), angles.sin(), 0.0 * angles], dim=1)
 
@@ -95,11 +93,11 @@ def test_candidates_that_are_nearly_equal_count_once():
     assert rig.distinct(T, score).tolist() == [0, 2, 4]
 
 
-def photograph(index: int, sees: bool) -> Any:
+def photograph(index, sees):
     return SimpleNamespace(index=index, sees=lambda _, T: torch.tensor([sees] * len(T)))
 
 
-def evidence_of(*similarity: float) -> Evidence:
+def evidence_of(*similarity):
     nothing = torch.zeros(len(similarity), 1, dtype=torch.float64)
     values = Evidence(*[nothing] * len(fields(Evidence)))
     return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64)[:, None])
@@ -121,7 +119,7 @@ def test_photographs_that_do_not_show_the_pose_are_named(monkeypatch, sees, simi
     monkeypatch.setattr(rig_module, "refinement_confidence", lambda known: known["similarity"])
     photographs = [photograph(index, seen) for index, seen in zip((3, 5, 8), sees, strict=True)]
     rig = rig_of(around(0.0, 90.0, 180.0), photographs=photographs)
-    answer: Any = SimpleNamespace(evidence=evidence_of(*similarity), T=ORIGIN[None])
+    answer = SimpleNamespace(evidence=evidence_of(*similarity), T=ORIGIN[None])
     reasons = rig.lost(answer)
     assert sorted(reasons) == lost
     for index, reason in reasons.items():
@@ -172,8 +170,8 @@ def test_a_pose_is_seen_where_its_box_overlaps_that_of_the_photograph(monkeypatc
     in_front = torch.tensor([True, True, True, False])
     monkeypatch.setattr(rig_module, "boxes_at", lambda *_: (boxes, in_front))
     photograph = SimpleNamespace(K=None, size=(20, 20), box=boxes[0])
-    one: Any = SimpleNamespace(camera=ORIGIN, photograph=photograph)
-    hull: Any = None
+    one = SimpleNamespace(camera=ORIGIN, photograph=photograph)
+    hull = None
     # the second overlaps by a third, the third by a quarter
     assert RigPhotograph.sees(one, hull, ORIGIN.repeat(4, 1, 1)).tolist() == [
         True,
@@ -183,11 +181,11 @@ def test_a_pose_is_seen_where_its_box_overlaps_that_of_the_photograph(monkeypatc
     ]
 
 
-def problem(**changes: Any) -> RigProblem:
+def problem(**changes):
     """Two world poses in two photographs each."""
-    nothing: Any = None
+    nothing = None
     eye = torch.eye(3).double()
-    given: dict[str, Any] = {
+    given = {
         "contours": SimpleNamespace(centre=CENTRE),
         "edges": nothing,
         "image_index": torch.tensor([0, 1, 0, 1]),

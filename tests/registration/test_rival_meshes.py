@@ -2,13 +2,12 @@
 
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import pytest
 import torch
 import trimesh
 
-from curvireg_torch import Registrar, Registration, ViewBank, sample_views
+from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.fitting.details import ContourDetails
 from curvireg_torch.registration import FailedRegistration
@@ -19,7 +18,7 @@ from tests.registration.test_ties import photograph
 
 
 @cache
-def truck(*, with_cabin: bool = True) -> trimesh.Trimesh:
+def truck(*, with_cabin=True):
     parts = [
         trimesh.creation.box((200, 90, 50)),
         trimesh.creation.box((20, 30, 30)).apply_translation((90, 20, 40)),
@@ -30,13 +29,13 @@ def truck(*, with_cabin: bool = True) -> trimesh.Trimesh:
 
 
 @cache
-def bank(*, with_cabin: bool = True, scale: float = 1.0) -> ViewBank:
+def bank(*, with_cabin=True, scale=1.0):
     mesh = truck(with_cabin=with_cabin).copy().apply_scale(scale)
     views = sample_views(azimuth_step=15, elevations=[10, 30, 50])
     return ViewBank.build(mesh, views, image_size=96, progress=False)
 
 
-def registered(shown: trimesh.Trimesh, *banks: ViewBank) -> Registration:
+def registered(shown, *banks):
     image, box, _ = photograph(shown, 35.0, 25.0, 0)
     return Registrar(list(banks))([image], box[None], CAMERA)[0]
 
@@ -61,7 +60,7 @@ def test_a_variant_with_a_part_more_is_told_from_that_without(with_cabin):
         assert result.ambiguous is None
 
 
-def result_of(similarity: float, confidence: float, rival: float = 0.1) -> Registration:
+def result_of(similarity, confidence, rival=0.1):
     made = registration(confidence=confidence)
     names = "rank", "similarity", "edge_support", "appearance", "keypoints", "details", "contours"
     nothing = dict.fromkeys(names, 0.0)
@@ -72,7 +71,7 @@ def result_of(similarity: float, confidence: float, rival: float = 0.1) -> Regis
     return replace(made, hypotheses=hypotheses)
 
 
-def best(*results: Any) -> Any:
+def best(*results):
     return best_of_meshes(results, [learned_registrar()] * len(results))
 
 
@@ -117,7 +116,7 @@ def test_without_probabilities_the_higher_score_decides():
 
 
 def test_details_of_meshes_with_fewer_points_are_filled_with_invalid_ones():
-    def details(count: int) -> ContourDetails:
+    def details(count):
         ones = torch.ones(1, count)
         return ContourDetails(torch.ones(1, count, 2), ones, ones.bool(), ones.bool())
 

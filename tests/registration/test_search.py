@@ -1,12 +1,10 @@
 """The preset "paper": its stages, and its search between coherent views."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 import trimesh
-from torch import Tensor
 
 from curvireg_torch import Registrar, ViewBank
 from curvireg_torch.errors import InvalidInputError
@@ -75,17 +73,17 @@ class Peak:
     """A matcher that knows the best view: the nearer a view is to it, in angle and distance, the
     better."""
 
-    def __init__(self, bank: Any, truth: Tensor, distance: float) -> None:
+    def __init__(self, bank, truth, distance):
         self.bank = bank
         self.compared = []
         self.truth = truth
         self.distance = distance
 
-    def scores(self, views: Any) -> Tensor:
+    def scores(self, views):
         angle = rotation_error(views.rotations, self.truth.float())
         return -(angle.square()) / 100.0 - (views.distance - self.distance).square()
 
-    def compare_views(self, _: Any, views: Any) -> Tensor:
+    def compare_views(self, _, views):
         self.compared.append(views)
         return self.scores(views)
 
@@ -93,7 +91,7 @@ class Peak:
 class TwoPeaks(Peak):
     """A second view, 10 degrees of azimuth farther, is nearly as good as the best."""
 
-    def scores(self, views: Any) -> Tensor:
+    def scores(self, views):
         farther = rotation_from_viewpoint(10.0, 0.0) @ rotation_from_viewpoint(0.0, 0.0).T
         angle = rotation_error(views.rotations, farther.float() @ self.truth.float())
         second = -(angle.square()) / 100.0 - (views.distance - self.distance).square() - 0.01
@@ -103,19 +101,19 @@ class TwoPeaks(Peak):
 class Scattered(Peak):
     """The best view has no neighbour among the best three: azimuths of 100 and 180 follow it."""
 
-    def scores(self, views: Any) -> Tensor:
+    def scores(self, views):
         far = ((views.azimuth - 140.0).abs().round() == 40.0) & (views.elevation.abs() < 1.0)
         return torch.where(far, -0.6, super().scores(views))
 
 
 def searched(
-    *truth: float,
-    camera: str = "perspective",
-    frame: str = "own",
-    allowed: tuple[float, float] = (0.0, 360.0),
-    kind: type[Peak] = Peak,
-    least_coherent: int = 1,
-) -> tuple[float, float, Any]:
+    *truth,
+    camera="perspective",
+    frame="own",
+    allowed=(0.0, 360.0),
+    kind=Peak,
+    least_coherent=1,
+):
     """Error of the rotation in degrees and distance in radii that the search finds on a bank of
     neighbours, some of which are allowed, and the matcher."""
     mesh = trimesh.creation.box((1, 2, 3))
@@ -128,11 +126,11 @@ def searched(
     bank = ViewBank.build(mesh, views, pipeline=pipeline, progress=False)
     azimuth, elevation, distance = truth
     R = rotation_from_viewpoint(azimuth, elevation).double() @ turn
-    matcher: Any = kind(bank, R, distance)
+    matcher = kind(bank, R, distance)
     matcher.turn = turn
     order = matcher.scores(views).argsort(descending=True, stable=True)[None]
     inside = ((grid.azimuth >= allowed[0]) & (grid.azimuth <= allowed[1]))[None]
-    ranking: Any = type("Ranking", (), {"order": order, "allowed": inside})()
+    ranking = type("Ranking", (), {"order": order, "allowed": inside})()
     matcher.ranking = ranking
     rotation, found = search.search(matcher, None, ranking, least_coherent=least_coherent)
     return float(rotation_error(rotation, R)), float(found) / (0.5 * 14**0.5), matcher
@@ -222,12 +220,12 @@ def test_an_orthographic_search_keeps_the_distance_that_it_cannot_see():
     assert distance == pytest.approx(3.0)
 
 
-def paper_registrar(**changes: Any) -> Registrar:
+def paper_registrar(**changes):
     return Registrar(truck_bank().mesh, pipeline=replace(PRESETS["paper"], **changes))
 
 
 def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
-    def refused(*_: Any, **__: Any) -> Any:
+    def refused(*_, **__):
         raise AssertionError("not a stage of the paper")
 
     for module, name in (
@@ -242,7 +240,7 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
     monkeypatch.setattr(KeypointMatches, "agreeing", refused)
     monkeypatch.setattr(Appearance, "build", refused)
     monkeypatch.setattr(Registrar, "object_mask", refused)
-    shown: list[str] = []
+    shown = []
     bank = ViewBank.build(
         truck_bank().mesh, pipeline=PRESETS["paper"], progress=lambda *x: shown.append(x[0])
     )
@@ -294,7 +292,7 @@ def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh
 def test_the_search_comes_nearer_than_its_views():
     upright = ViewPolicy(pose="upright", azimuth_step=20.0)
     settings = {"views": upright, "bank": BankSettings(), "field": "focus"}
-    errors: dict[bool, list[float]] = {}
+    errors = {}
     for with_search in (True, False):
         given = replace(
             PRESETS["classical"], box_jitter=0.0, contours=False, search=with_search, **settings

@@ -2,16 +2,14 @@
 
 from dataclasses import fields, replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.evidence import Evidence
 from curvireg_torch.pipeline import PRESETS, Pipeline
-from curvireg_torch.registration import Registration, several
+from curvireg_torch.registration import several
 from curvireg_torch.registration.confidence import hypothesis_probabilities
 from curvireg_torch.registration.rig import Answer
 
@@ -19,7 +17,7 @@ ANY_RIGHT = 0.8
 EYE = torch.eye(4, dtype=torch.float64)
 
 
-def photograph(index: int, **changes: Any) -> Any:
+def photograph(index, **changes):
     """A photograph that was registered alone, with a ``confidence`` and an ``angle`` from the joint
     pose."""
     features = {"ranking_share": changes.pop("ranking_share", 0.5)}
@@ -58,15 +56,15 @@ class FakeRig:
     describer = SimpleNamespace(hull=None)
     symmetries = torch.eye(3).double()[None]
 
-    def __init__(self, _: Any, photographs: list[Any]) -> None:
+    def __init__(self, _, photographs):
         self.photographs = photographs
 
     @staticmethod
-    def of(_: Any, found: dict[int, Any]) -> "FakeRig":
+    def of(_, found):
         usable = [one for one in found.values() if not isinstance(one, LostObjectError)]
         return FakeRig(None, usable)
 
-    def answer(self) -> Answer:
+    def answer(self):
         rows = torch.tensor([self.scores[p.index] for p in self.photographs]).double()
         nothing = torch.zeros_like(rows)
         values = Evidence(*[nothing] * len(fields(Evidence)))
@@ -74,41 +72,41 @@ class FakeRig:
         C = torch.full((M, 6, 6), torch.nan).double()
         return Answer(EYE.repeat(M, 1, 1), replace(values, similarity=0.1 * rows), rows, C)
 
-    def lost(self, _: Answer) -> dict[int, str]:
+    def lost(self, _):
         there = [p.index for p in self.photographs]
         return {index: why for index, why in self.missing.items() if index in there}
 
-    def weights(self, _: Tensor) -> Tensor:
+    def weights(self, _):
         return torch.tensor([self.vote.get(p.index, 1.0) for p in self.photographs]).double()
 
-    def angles(self, poses: Tensor, _: Tensor) -> Tensor:
+    def angles(self, poses, _):
         return poses[:, 0, 0]
 
-    def hypothesis(self, _: Answer, m: int, mean: Evidence) -> Any:
+    def hypothesis(self, _, m, mean):
         return SimpleNamespace(number=m, similarity=float(mean.similarity[m]))
 
 
 def joint(
-    monkeypatch: pytest.MonkeyPatch,
-    found: dict[int, Any],
-    scores: dict[int, list[float]],
+    monkeypatch,
+    found,
+    scores,
     *,
-    missing: dict[int, str] | None = None,
-    vote: dict[int, float] | None = None,
-    count: int = 5,
-    pipeline: Pipeline | None = None,
-) -> Registration:
+    missing=None,
+    vote=None,
+    count=5,
+    pipeline=None,
+):
     FakeRig.scores = scores
     FakeRig.missing = missing or {}
     FakeRig.vote = vote or {}
     monkeypatch.setattr(several, "Rig", FakeRig)
     monkeypatch.setattr(several, "probability_of_any", lambda *_, **__: ANY_RIGHT)
     monkeypatch.setattr(several, "outside_fraction", lambda _, __, ___, size: size[0] / 1000.0)
-    target: Any = SimpleNamespace(pipeline=pipeline or Pipeline())
+    target = SimpleNamespace(pipeline=pipeline or Pipeline())
     return several._registration(target, found, EYE.repeat(len(found), 1, 1), count)
 
 
-def two(**changes: Any) -> dict[int, Any]:
+def two(**changes):
     return {0: photograph(0, **changes), 1: photograph(1)}
 
 

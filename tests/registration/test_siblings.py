@@ -3,12 +3,10 @@
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import (
@@ -23,7 +21,7 @@ from curvireg_torch.registration.target import TellingSymmetries
 from tests._support.scenes import CAMERA
 
 
-def four(similarity: list[float], compare: list[list[float]], angles: list[float]) -> Siblings:
+def four(similarity, compare, angles):
     """Siblings turned about z by ``angles``, the first of which has the highest score; all look
     different from the others."""
     R = torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in angles])
@@ -37,7 +35,7 @@ def four(similarity: list[float], compare: list[list[float]], angles: list[float
     return Siblings(poses, details, different, EvidenceWeights())
 
 
-def evidence(*similarity: float) -> Evidence:
+def evidence(*similarity):
     nothing = Evidence.zeros(len(similarity))
     return replace(nothing, similarity=torch.tensor(similarity, dtype=torch.float64))
 
@@ -83,7 +81,7 @@ def test_siblings_that_look_alike_are_rivals_if_the_hidden_feature_is_notable():
     assert is_hidden
 
 
-def turns_about_z(count: int) -> Tensor:
+def turns_about_z(count):
     angles = torch.arange(count).double() * (2.0 * math.pi / count)
     R = rotation_from_axis_angle(angles[:, None] * torch.tensor([0.0, 0.0, 1.0]).double())
     return transform(R, torch.zeros(count, 3).double())
@@ -93,7 +91,7 @@ class Case:
     """A pose at 0 degrees that lies outside the limits, the best at 40, and another at 80; three
     siblings of the best have the similarities ``measured``, a sibling that is fitted 0.95."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, measured: list[float]) -> None:
+    def __init__(self, monkeypatch, measured):
         self.fitted: list[Hypotheses] = []
         self.symmetries = turns_about_z(3)
         self.poses = four([0.0] * 3, [[0.0] * 3] * 3, [0, 40, 80]).poses
@@ -109,27 +107,25 @@ class Case:
             ),
         )
 
-    def fit(
-        self, target: Any, block: Any, crops: Any, starts: Hypotheses, *, refit: bool
-    ) -> Hypotheses:
+    def fit(self, target, block, crops, starts, *, refit):
         assert refit
         self.fitted.append(starts)
         moved = starts.T.clone()
         moved[:, 0, 3] += 1e-3
         return replace(starts, T=moved)
 
-    def run(self, keeps: list[bool] | None = None) -> tuple[Hypotheses, Evidence, Hypotheses]:
+    def run(self, keeps=None):
         """``keeps``: what the limits say, one call after the other."""
-        target: Any = SimpleNamespace(
+        target = SimpleNamespace(
             telling_symmetries=TellingSymmetries(self.symmetries),
             describer=SimpleNamespace(device_contours=None, centre=torch.zeros(3).double()),
             score_weights=lambda **_: EvidenceWeights(),
         )
         answers = iter(keeps or [])
-        block: Any = MagicMock()
+        block = MagicMock()
         block.__len__.return_value = 1
         block.keeps = lambda poses: torch.tensor([next(answers, True)] * len(poses))
-        crops: Any = None
+        crops = None
         outside = torch.tensor([True, False, False])
         given = evidence(0.99, 0.9, 0.5)
         before = replace(self.poses, evidence=given, is_outside=outside)

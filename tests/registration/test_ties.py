@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from torch import Tensor
 
-from curvireg_torch import Registrar, Registration, ViewBank, sample_views
+from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint, transform
 from curvireg_torch.mesh import mesh_centre, mesh_radius, mesh_symmetries
 from curvireg_torch.mesh.symmetry import FEATURE_FRACTION, feature_fractions
@@ -20,7 +19,7 @@ from tests._support.scenes import CAMERA, SIZE
 
 
 @cache
-def hollow_box() -> trimesh.Trimesh:
+def hollow_box():
     """A box of 200 x 120 x 90, one half of which is hollow from below: from above it looks like a
     plain box."""
     outer = trimesh.creation.box((200, 120, 90))
@@ -36,7 +35,7 @@ def hollow_box() -> trimesh.Trimesh:
 
 
 @cache
-def marked_box() -> trimesh.Trimesh:
+def marked_box():
     """A box with a cube of 11.5 % of its radius on one end of its top."""
     box = trimesh.creation.box((200, 120, 80))
     cube = trimesh.creation.box((14, 14, 14))
@@ -45,14 +44,12 @@ def marked_box() -> trimesh.Trimesh:
 
 
 @cache
-def registrar_of(mesh: trimesh.Trimesh, **options: object) -> Registrar:
+def registrar_of(mesh, **options):
     views = sample_views(azimuth_step=15, elevations=[10, 30, 50])
     return Registrar(ViewBank.build(mesh, views, image_size=96, progress=False), **options)
 
 
-def photograph(
-    mesh: trimesh.Trimesh, azimuth: float, elevation: float, seed: int
-) -> tuple[Tensor, Tensor, Tensor]:
+def photograph(mesh, azimuth, elevation, seed):
     """(3, H, W), its box (4,) and the true ``T_cam_from_model``."""
     generator = torch.Generator().manual_seed(seed)
     R = rotation_from_viewpoint(azimuth, elevation, 0.0).double()
@@ -61,9 +58,7 @@ def photograph(
     return (*synthesize_photograph(mesh, T, CAMERA, SIZE, generator), T)
 
 
-def registered(
-    registrar: Registrar, azimuth: float, elevation: float, seed: int
-) -> tuple[Registration, float]:
+def registered(registrar, azimuth, elevation, seed):
     """The result and its error in degrees."""
     image, box, T = photograph(registrar.bank.mesh, azimuth, elevation, seed)
     result = registrar([image], box[None], CAMERA)[0]

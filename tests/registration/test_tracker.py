@@ -4,7 +4,6 @@ generated sequences."""
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -70,7 +69,7 @@ def shift_in_pixels(T, truth):
     return float((uv[0][:, :2] / uv[0][:, 2:] - uv[1][:, :2] / uv[1][:, 2:]).norm(dim=1).mean())
 
 
-def plate(x: float = 0.0, y: float = 0.0):
+def plate(x=0.0, y=0.0):
     """A plate with a print, 160 px wide, moved in its plane by (x, y): its window, pose, and
     depth."""
     T = transform(
@@ -88,13 +87,13 @@ def plate(x: float = 0.0, y: float = 0.0):
     return framed(grey), T, depth
 
 
-def framed(grey) -> Frame:
+def framed(grey):
     """A frame of which only the grey picture is looked at."""
-    none: Any = None
+    none = None
     return Frame(none, grey, WINDOW_K, none)
 
 
-def keyframe_of(window, T, depth) -> Keyframe:
+def keyframe_of(window, T, depth):
     uv, model = surface_corners(window.grey, depth, T, WINDOW_K, quality=0.01, inside=3)
     return Keyframe(window.grey, T, uv, model)
 
@@ -152,7 +151,7 @@ def test_a_step_follows_edges_the_end_of_the_colours_and_corners(monkeypatch):
     follow.start(drawn(START), K, START)
     found = follow.measure(drawn(START), K, moved(START, [0.0, 0.0, 0.01], [0.01, 0.0, 0.0]))
     state = found.state
-    used: list[Any] = []
+    used = []
 
     def selected_step(_problem, _points, _uv, J, _radius, equations):
         used.extend([J, *equations])

@@ -20,7 +20,7 @@ K = torch.tensor([[200.0, 0, 99.5], [0, 200.0, 49.5], [0, 0, 1]], dtype=torch.fl
 SIZE = (100, 200)
 
 
-def at(x: float = 0.0, z: float = 5.0) -> Tensor:
+def at(x=0.0, z=5.0):
     return pose([0.0, 0.0, 0.0], [x, 0.0, z])[None]
 
 
@@ -56,14 +56,14 @@ class Flow:
     ratio: float = 0.0
     weight: float = 1.0
 
-    def moved(self, before: Tensor, after: Tensor) -> "Flow":
+    def moved(self, before, after):
         assert before.equal(self.K)
         return replace(self, K=after)
 
-    def inlier_ratio(self, *_: Any) -> float:
+    def inlier_ratio(self, *_):
         return self.ratio
 
-    def scaled(self, weight: float) -> "Flow":
+    def scaled(self, weight):
         return replace(self, weight=weight)
 
 
@@ -79,39 +79,39 @@ class Problem:
 
     stale: bool
 
-    def state(self, T: Tensor) -> State:
+    def state(self, T):
         return State(T)
 
-    def with_current_contours(self, state: State) -> State:
+    def with_current_contours(self, state):
         return State(state.T, points="again") if self.stale else state
 
 
 def fitted(
-    monkeypatch: pytest.MonkeyPatch,
-    keyframes: list[Any],
-    last: Any,
-    shift: float = 100.0,
+    monkeypatch,
+    keyframes,
+    last,
+    shift=100.0,
     *,
-    stale: bool = False,
-    searched: list[float] | None = None,
-) -> list[Any]:
+    stale=False,
+    searched=None,
+):
     """The weighted flows that a fit uses, of the keyframe that is nearest: the second. In the first
     crop, with a focal length of 1 px, the flow moves the object by a ``shift`` in px. Steps leave a
     pose that is not quite rigid; their radii in px are ``searched``."""
     cameras = [torch.tensor([zoom, zoom, 1.0]).double().diag()[None] for zoom in (1.0, 2.0)]
     frames = [SimpleNamespace(K=camera, problem=Problem(stale)) for camera in cameras]
-    used: list[Any] = []
+    used = []
 
-    def track(keyframe: Any, frame: Any, *_: Any, levels: int) -> Flow:
+    def track(keyframe, frame, *_, levels):
         return Flow(frame.K, f"{keyframe.name} {levels}")
 
-    def step(_: Any, state: State, corners: list[Flow], radius: float) -> Tensor:
+    def step(_, state, corners, radius):
         used[:] = [(flow.weight, flow.start, float(flow.K[0, 0, 0])) for flow in corners]
         if searched is not None:
             searched.append(radius)
         return state.T * torch.tensor([1.01, 1.01, 1.01, 1.0])
 
-    def tracked(frame: Any, state: State, flows: list[Flow]) -> tuple[float, int]:
+    def tracked(frame, state, flows):
         assert torch.allclose(state.T[:, :3, :3], torch.eye(3).double())
         assert state.points == ("again" if stale else None)
         return float(frame.K[0, 0, 0]), len(flows)
@@ -120,7 +120,7 @@ def fitted(
     monkeypatch.setattr(tracking, "fit_points", lambda *_: at(x=5.0 * shift))
     monkeypatch.setattr(tracking, "PointMatches", SimpleNamespace(cat_within=list))
     angles = torch.tensor([9.0, 2.0, 5.0])
-    follow: Any = SimpleNamespace(
+    follow = SimpleNamespace(
         _last=last,
         _keyframes=keyframes,
         _frame=lambda *_: frames.pop(0),
@@ -130,14 +130,14 @@ def fitted(
         centre=torch.zeros(3).double(),
         hull=HULL * torch.tensor([1.0, 1.0, 0.0]),
     )
-    image: Any = None
+    image = None
     camera, flows = Tracker._fit(follow, image, K, at())
     assert camera == used[0][2]
     assert flows == len(used)
     return used
 
 
-def named(name: str) -> Any:
+def named(name):
     return SimpleNamespace(name=name)
 
 
@@ -168,17 +168,17 @@ def test_a_round_is_left_out_after_one_that_hardly_moved_the_contours(monkeypatc
     assert searched == [radius for radius in radii for _ in range(tracking.STEPS_PER_ROUND)]
 
 
-def features(mean: list[float], variance: list[float], flows: list[Flow]) -> dict[str, float]:
+def features(mean, variance, flows):
     ends = torch.tensor(mean).double(), torch.tensor(variance).double()
-    follow: Any = SimpleNamespace(
+    follow = SimpleNamespace(
         _regions=SimpleNamespace(ends=lambda *_: ends),
         _silhouette=lambda *_: None,
         centre=torch.zeros(3),
     )
     problem = SimpleNamespace(edge_support=lambda _: torch.tensor(0.4))
-    frame: Any = SimpleNamespace(problem=problem, K=K, bins=None)
-    state: Any = State(at())
-    given: Any = flows
+    frame = SimpleNamespace(problem=problem, K=K, bins=None)
+    state = State(at())
+    given = flows
     return dict(Tracker._tracked(follow, frame, state, given).features)
 
 
@@ -206,19 +206,19 @@ def test_features_in_closed_form():
 )
 def test_the_prediction_that_convinces_ends_the_search_else_the_best_counts(confidences, expected):
     guesses = dict(zip("ab", confidences, strict=True))
-    follow: Any = SimpleNamespace(
+    follow = SimpleNamespace(
         reliable=0.9,
         predictions=lambda: list(guesses),
         _fit=lambda _, __, T: SimpleNamespace(confidence=guesses[T]),
     )
-    nothing: Any = None
+    nothing = None
     assert Tracker.track(follow, nothing, nothing).confidence == expected
 
 
 def test_starting_again_forgets_what_was_seen(monkeypatch):
     """Of three accepted poses the last two predict the next one."""
     renderer = SimpleNamespace(render=lambda *_: torch.zeros(1))
-    contours: Any = SimpleNamespace(
+    contours = SimpleNamespace(
         centre=torch.zeros(3).double(), radius=1.0, renderer=lambda _: renderer
     )
     follow = Tracker(contours, HULL)
@@ -226,14 +226,14 @@ def test_starting_again_forgets_what_was_seen(monkeypatch):
     monkeypatch.setattr(follow, "_remember", lambda *_: follow._keyframes.append(None))
     poses = {x: SimpleNamespace(state=State(at(x)), frame=SimpleNamespace(K=K)) for x in (0, 1, 3)}
     for seen in poses.values():
-        given: Any = seen
+        given = seen
         follow.accept(given)
     predicted, last = follow.predictions()
     assert float(last[0, 0, 3]) == 3.0
     assert float(predicted[0, 0, 3]) == pytest.approx(5.0)
     regions = follow._regions
     monkeypatch.setattr(follow, "measure", lambda *_: poses[1])
-    nothing: Any = None
+    nothing = None
     follow.start(nothing, nothing, nothing)
     assert [float(T[0, 0, 3]) for T in follow.predictions()] == [1.0]
     assert len(follow._keyframes) == 1
@@ -245,9 +245,7 @@ def test_a_turn_goes_on_about_the_axes_of_the_camera():
     """From A to B it is B A^T, and so B A^T B comes next."""
     before = pose([0.3, 0.0, 0.0], [0.0, 0.0, 5.0])[None]
     last = pose([0.0, 0.5, 0.0], [0.0, 0.0, 5.0])[None]
-    follow: Any = SimpleNamespace(
-        _poses=[before, last], last_pose=last, centre=torch.zeros(3).double()
-    )
+    follow = SimpleNamespace(_poses=[before, last], last_pose=last, centre=torch.zeros(3).double())
     predicted, _ = Tracker.predictions(follow)
     A = before[0, :3, :3]
     B = last[0, :3, :3]
@@ -257,9 +255,9 @@ def test_a_turn_goes_on_about_the_axes_of_the_camera():
 @pytest.mark.parametrize(("angle", "count"), [(7.9, 1), (8.1, 2)])
 def test_frames_from_other_directions_are_kept(monkeypatch, angle, count):
     monkeypatch.setattr(tracking, "surface_corners", lambda *_, **__: (None, None))
-    follow: Any = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([50.0, angle]))
-    frame: Any = SimpleNamespace(grey=None, K=K)
-    nothing: Any = None
+    follow = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([50.0, angle]))
+    frame = SimpleNamespace(grey=None, K=K)
+    nothing = None
     for _ in range(2):
         Tracker._remember(follow, frame, at(), nothing)
     assert len(follow._keyframes) == count
@@ -268,9 +266,9 @@ def test_frames_from_other_directions_are_kept(monkeypatch, angle, count):
 
 def test_so_many_keyframes_are_kept(monkeypatch):
     monkeypatch.setattr(tracking, "surface_corners", lambda *_, **__: (None, None))
-    follow: Any = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([90.0]))
-    frame: Any = SimpleNamespace(grey=None, K=K)
-    nothing: Any = None
+    follow = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([90.0]))
+    frame = SimpleNamespace(grey=None, K=K)
+    nothing = None
     for x in range(40):
         Tracker._remember(follow, frame, at(float(x)), nothing)
     kept = [float(keyframe.T[0, 0, 3]) for keyframe in follow._keyframes]
@@ -281,7 +279,7 @@ def test_colours_are_learned_on_both_sides_of_the_outline():
     """Lines across the left border of an object that fills the right half of the crop."""
     depth = torch.zeros(1, 1, CROP_SIZE, CROP_SIZE)
     depth[..., 128:] = 5.0
-    learned: list[Tensor] = []
+    learned = []
 
     outline = Silhouette(
         torch.tensor([[128.0, 90.0]]).expand(3, 2),
@@ -289,14 +287,12 @@ def test_colours_are_learned_on_both_sides_of_the_outline():
         torch.zeros(3),
     )
 
-    def learn(_: Any, samples: Tensor, __: Tensor, inside: Tensor) -> None:
+    def learn(_, samples, __, inside):
         learned.extend([samples[..., 0].flatten(), inside.flatten()])
 
-    follow: Any = SimpleNamespace(
-        _silhouette=lambda *_: outline, _regions=SimpleNamespace(learn=learn)
-    )
-    frame: Any = SimpleNamespace(bins=None)
-    state: Any = None
+    follow = SimpleNamespace(_silhouette=lambda *_: outline, _regions=SimpleNamespace(learn=learn))
+    frame = SimpleNamespace(bins=None)
+    state = None
     Tracker._learn(follow, frame, state, depth)
     x, inside = learned
     band = tracking.LEARNED_BAND
@@ -315,11 +311,11 @@ def test_lines_along_which_colours_say_nothing_do_not_count():
     mean = torch.tensor([1.0, 2.0, -1.0]).double()
     variance = torch.tensor([0.0, flat, 2.0 * flat]).double()
     J = torch.ones(1, 3, 6).double()
-    follow: Any = SimpleNamespace(
+    follow = SimpleNamespace(
         _regions=SimpleNamespace(ends=lambda *_: (mean, variance)), _silhouette=lambda *_: None
     )
-    frame: Any = SimpleNamespace(bins=None)
-    nothing: Any = None
+    frame = SimpleNamespace(bins=None)
+    nothing = None
     colours = Tracker._colours(follow, frame, nothing, J, radius)
     information = 1.0 / tracking.REGION_VARIANCE - 3.0 / radius**2
     expected = [tracking.REGION_WEIGHT * information, 0.0, 0.0]

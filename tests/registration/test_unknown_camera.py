@@ -3,11 +3,9 @@
 import math
 from dataclasses import fields, replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evidence import Evidence, EvidenceWeights
@@ -26,12 +24,12 @@ from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.photograph import Photograph
 from tests._support.scenes import CAMERA, SIZE
 
-NOTHING: Any = None
+NOTHING = None
 CENTRE = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64)
 BOX = torch.tensor([60.0, 40.0, 180.0, 140.0])
 
 
-def poses_at(count: int, *, K: Tensor = CAMERA, rank: list[float] | None = None) -> Hypotheses:
+def poses_at(count, *, K=CAMERA, rank=None):
     """Of the views 0, 1, ..., turned about the vertical axis."""
     R = torch.stack([rotation_from_viewpoint(70.0 * k, 30.0, 0.0).double() for k in range(count)])
     T = transform(R, torch.tensor([0.1, 0.0, 5.0]).double().expand(count, 3))
@@ -39,7 +37,7 @@ def poses_at(count: int, *, K: Tensor = CAMERA, rank: list[float] | None = None)
     return Hypotheses.at(T, K.expand(count, 3, 3), CENTRE, torch.arange(count), ranks)
 
 
-def evidence_of(*similarity: float) -> Evidence:
+def evidence_of(*similarity):
     nothing = torch.zeros(len(similarity), dtype=torch.float64)
     values = Evidence(*[nothing] * len(fields(Evidence)))
     return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64))
@@ -81,23 +79,23 @@ def test_starts_are_the_best_view_of_each_camera_and_the_best_views():
 @pytest.mark.parametrize(("source", "factors"), [("estimated", [2, 1]), ("exif", [1])])
 def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source, factors):
     poses = poses_at(1)
-    fitted: list[int] = []
+    fitted = []
 
-    def problem(_: Any, __: Any, K: Tensor, ___: Tensor, *, factor: int = 1) -> Any:
+    def problem(_, __, K, ___, *, factor=1):
         return SimpleNamespace(factor=factor, K=K, edge_support=lambda _: torch.ones(1))
 
-    def fit(problem: Any, T: Tensor, *_: Any) -> Any:
+    def fit(problem, T, *_):
         fitted.append(problem.factor)
         zoom = torch.tensor([0.1], dtype=torch.float64)
         return SimpleNamespace(problem=problem, state=SimpleNamespace(T=T), log_zoom=zoom)
 
-    def measured(_: Any, __: Any, support: Tensor, ___: Tensor) -> Any:
+    def measured(_, __, support, ___):
         return replace(poses.fit, edge_support=support.double())
 
     monkeypatch.setattr(camera_module.ContourProblem, "of", problem)
     monkeypatch.setattr(camera_module, "fit_focal_length", fit)
     monkeypatch.setattr(camera_module, "measured_fit", measured)
-    describer: Any = SimpleNamespace(contours=None, centre=CENTRE)
+    describer = SimpleNamespace(contours=None, centre=CENTRE)
     item = Photograph(torch.zeros(3, *SIZE), BOX, CAMERA)
     item = replace(item, camera_source=source, focal_deviation=0.1)
     found = camera_module.with_focal_length(describer, NOTHING, poses, item)
@@ -116,7 +114,7 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
     problem = SimpleNamespace(state=lambda _: None)
     monkeypatch.setattr(camera_module.ContourProblem, "of", lambda *_: problem)
     monkeypatch.setattr(camera_module, "focal_information", lambda *_: (information, motion))
-    describer: Any = SimpleNamespace(contours=None, centre=CENTRE)
+    describer = SimpleNamespace(contours=None, centre=CENTRE)
     item = Photograph(torch.zeros(3, *SIZE), BOX, CAMERA)
     item = replace(item, focal_deviation=0.2)
     covariance, deviation = camera_module.focal_covariance(describer, NOTHING, pose, item)
@@ -136,32 +134,32 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
 
 
 def refitted(
-    monkeypatch: pytest.MonkeyPatch,
-    evidence: Evidence,
-    new: dict[int, float],
+    monkeypatch,
+    evidence,
+    new,
     *,
-    tried_cameras: bool,
-    outside: list[bool] | None = None,
-) -> tuple[list[int], list[int], Evidence]:
+    tried_cameras,
+    outside=None,
+):
     """Views that were fitted with their focal lengths, those that changed, and the evidence."""
     poses = poses_at(len(evidence))
-    tried: list[int] = []
+    tried = []
 
-    def fit(_: Any, __: Any, some: Hypotheses, ___: Any) -> Hypotheses:
+    def fit(_, __, some, ___):
         tried.extend(some.view.tolist())
         return replace(some, cameras=2.0 * some.cameras)
 
-    def measure(_: Any, __: Any, some: Hypotheses) -> Hypotheses:
+    def measure(_, __, some):
         return replace(some, evidence=evidence_of(*[new[view] for view in some.view.tolist()]))
 
     monkeypatch.setattr(camera_module, "with_focal_length", fit)
     monkeypatch.setattr(camera_module, "with_evidence", measure)
-    target: Any = SimpleNamespace(
+    target = SimpleNamespace(
         score_weights=lambda **_: EvidenceWeights(),
         describer=SimpleNamespace(centre=CENTRE),
         pipeline=Pipeline(),
     )
-    block: Any = SimpleNamespace(
+    block = SimpleNamespace(
         tried_cameras=torch.tensor([tried_cameras]),
         photographs=[SimpleNamespace(focal_deviation=0.1)],
         symmetries=None,
@@ -211,9 +209,9 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
     )
     best = torch.full((1, 6, 6), 2.0, dtype=torch.float64)
     monkeypatch.setattr(camera_module, "focal_covariance", lambda *_: (best, 0.07))
-    target: Any = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), describer=None)
+    target = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), describer=None)
     item = replace(Photograph(torch.zeros(3, *SIZE), BOX, CAMERA), focal_deviation=0.1)
-    given: dict[str, Any] = {field.name: None for field in fields(Block)}
+    given = {field.name: None for field in fields(Block)}
     block = Block(**given | {"photographs": [item]})
     outside = torch.tensor([False, False, True])
     before = replace(poses, evidence=evidence_of(0.7, 0.8, 0.9), is_outside=outside)
@@ -226,18 +224,18 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
 
 
 def test_limits_of_an_unknown_camera_are_wider_by_how_far_the_box_is_off_the_axis(monkeypatch):
-    made: list[tuple[Any, float]] = []
+    made = []
 
-    def limits(item: Photograph, _: Any, off_centre: float = 0.0) -> str:
+    def limits(item, _, off_centre=0.0):
         made.append((item.camera_matrix, off_centre))
         return "limits"
 
     monkeypatch.setattr(camera_module, "Limits", limits)
-    prior: Any = SimpleNamespace(distance=None)
+    prior = SimpleNamespace(distance=None)
     known = Photograph(torch.zeros(3, *SIZE), BOX, CAMERA, prior)
     unknown = replace(known, camera_matrix=None)
-    target: Any = SimpleNamespace(bank=None, is_exact=True)
-    similar: Any = SimpleNamespace(bank=None, is_exact=False)
+    target = SimpleNamespace(bank=None, is_exact=True)
+    similar = SimpleNamespace(bank=None, is_exact=False)
     for one, item in ((target, known), (target, unknown), (similar, unknown)):
         assert camera_module.limits_of(one, item) == "limits"
     (first, none), (usual, off), (last, also_none) = made
@@ -245,6 +243,6 @@ def test_limits_of_an_unknown_camera_are_wider_by_how_far_the_box_is_off_the_axi
     assert (none, also_none, last) == (0.0, 0.0, None)
     assert torch.equal(usual, camera_module.usual_camera(SIZE))
     assert off == pytest.approx(camera_module.off_axis_angle(replace(known, camera_matrix=usual)))
-    with_distance: Any = SimpleNamespace(distance=(1.0, 2.0))
+    with_distance = SimpleNamespace(distance=(1.0, 2.0))
     with pytest.raises(InvalidInputError, match="distance"):
         camera_module.limits_of(similar, replace(unknown, prior=with_distance))

@@ -6,7 +6,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 import trimesh
-from torch import Tensor
 
 from curvireg_torch.errors import RenderingError
 from curvireg_torch.geometry import transform, uniform_views
@@ -16,7 +15,7 @@ BACKENDS = ("auto", "embree", "pyrender")
 
 
 @functools.cache
-def _works(backend: str) -> bool:
+def _works(backend):
     try:
         make_renderer(trimesh.creation.box(), backend)
     except RenderingError:
@@ -24,28 +23,26 @@ def _works(backend: str) -> bool:
     return True
 
 
-def require(*backends: str, orthographic: bool = False) -> None:
+def require(*backends, orthographic=False):
     """Skip where pyrender has no driver, and its parallel projection, which it lacks."""
     if "pyrender" in backends and (orthographic or not _works("pyrender")):
         pytest.skip("pyrender needs EGL, and draws in perspective")
 
 
 @pytest.fixture(params=BACKENDS)
-def backend(request: pytest.FixtureRequest) -> str:
+def backend(request):
     require(request.param)
     return str(request.param)
 
 
 @pytest.fixture(params=[False, True], ids=["perspective", "orthographic"])
-def orthographic(request: pytest.FixtureRequest) -> bool:
+def orthographic(request):
     if "backend" in request.fixturenames:
         require(request.getfixturevalue("backend"), orthographic=request.param)
     return bool(request.param)
 
 
-def camera(
-    count: int, *, radius: float = 1.0, centre: Tensor | None = None, orthographic: bool = False
-) -> tuple[Tensor, Tensor, tuple[int, int]]:
+def camera(count, *, radius=1.0, centre=None, orthographic=False):
     """Views from all around: off-centre camera, rectangular pixels, wide image, object partly
     outside."""
     R = uniform_views(count).rotations.double()
@@ -57,13 +54,13 @@ def camera(
     return transform(R, t), K, (108, 154)
 
 
-def pixel_grid(size: tuple[int, int]) -> Tensor:
+def pixel_grid(size):
     """(H, W, 3) homogeneous pixel coordinates, float64."""
     v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in size), indexing="ij")
     return torch.stack([u, v, torch.ones_like(u)], -1)
 
 
-def interior(a: Tensor, b: Tensor) -> Tensor:
+def interior(a, b):
     """Pixels whose eight neighbours are all object or all background in both images."""
     uniform = torch.ones_like(a, dtype=torch.bool)
     for depth in (a, b):
@@ -72,7 +69,7 @@ def interior(a: Tensor, b: Tensor) -> Tensor:
     return uniform
 
 
-def smooth(depth: Tensor, *, bend: float) -> Tensor:
+def smooth(depth, *, bend):
     """Pixels around which second differences of depth stay below ``bend``: no crease, no
     occlusion."""
     padded = F.pad(depth, (1, 1, 1, 1), mode="replicate")

@@ -2,7 +2,6 @@
 camera."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -133,7 +132,7 @@ def test_normals_of_a_smooth_surface_replace_those_of_edges_they_agree_with(
     level = SimpleNamespace(
         starts=first, ends=first + 1, normals=surface, is_smooth=torch.tensor([smooth])
     )
-    views: Any = SimpleNamespace(
+    views = SimpleNamespace(
         level=level, rotation=torch.eye(3)[None], focal_lengths=torch.ones(1, 1, 2)
     )
     places = _Places(

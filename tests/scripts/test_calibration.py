@@ -17,7 +17,7 @@ from scripts.calibration.calibrate import covariance_quality
 from scripts.scenes.scene import cut, look_at
 
 
-def options(**changes: object) -> Namespace:
+def options(**changes):
     return Namespace(**({"seed": 3, "models": 10, "cad": "exact"} | changes))
 
 

@@ -1,5 +1,4 @@
 import json
-from pathlib import Path
 
 import pytest
 
@@ -15,7 +14,7 @@ from scripts.confidence_table import (
 )
 
 
-def run(folder: Path, column: str) -> Path:
+def run(folder, column):
     results = [
         {"key": "a", "confidence": 0.95, "reliable": True, "ambiguous": None},
         {"key": "b", "confidence": 0.97, "reliable": True, "ambiguous": "several"},

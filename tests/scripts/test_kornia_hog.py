@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from skimage.feature import hog
-from torch import Tensor
 from torch.autograd import gradcheck
 
 from scripts.kornia.hog import HistogramOfOrientedGradients, histogram_of_oriented_gradients
@@ -13,7 +12,7 @@ CELL = (6, 5)
 BLOCK = (2, 3)
 
 
-def images(kind: str) -> Tensor:
+def images(kind):
     """(2, 3, 45, 38) float64; 45 and 38 are no multiples of the cell."""
     generator = torch.Generator().manual_seed(0)
     noise = torch.rand(2, 3, 45, 38, generator=generator, dtype=torch.float64)
@@ -30,17 +29,17 @@ def images(kind: str) -> Tensor:
 class TestHistogramOfOrientedGradients:
     @pytest.mark.parametrize("orientations", [1, 4, 9])
     @pytest.mark.parametrize("channels", [1, 3])
-    def test_smoke(self, orientations: int, channels: int) -> None:
+    def test_smoke(self, orientations, channels):
         out = histogram_of_oriented_gradients(torch.rand(1, channels, 32, 32), orientations)
         assert bool(out.isfinite().all())
 
     @pytest.mark.parametrize(("batch", "height", "width"), [(1, 24, 24), (3, 40, 33)])
-    def test_cardinality(self, batch: int, height: int, width: int) -> None:
+    def test_cardinality(self, batch, height, width):
         out = histogram_of_oriented_gradients(torch.rand(batch, 1, height, width))
         assert out.shape == (batch, height // 8 - 2, width // 8 - 2, 3, 3, 9)
         assert histogram_of_oriented_gradients(torch.rand(0, 1, height, width)).shape[0] == 0
 
-    def test_exception(self) -> None:
+    def test_exception(self):
         image = torch.rand(1, 1, 32, 32)
         for wrong, options, error in (
             (image.numpy(), {}, TypeError),
@@ -55,7 +54,7 @@ class TestHistogramOfOrientedGradients:
 
     @pytest.mark.parametrize("kind", ["random", "constant", "checkerboard", "ramp"])
     @pytest.mark.parametrize("channels", [1, 3])
-    def test_scikit_image(self, kind: str, channels: int) -> None:
+    def test_scikit_image(self, kind, channels):
         image = images(kind)[:, :channels]
         out = histogram_of_oriented_gradients(image, 8, CELL, BLOCK)
         for mine, picture in zip(out, image, strict=True):
@@ -72,19 +71,19 @@ class TestHistogramOfOrientedGradients:
             np.testing.assert_allclose(mine.numpy(), theirs, atol=1e-6)
 
     @pytest.mark.parametrize("kind", ["constant", "checkerboard"])
-    def test_gradients_are_finite(self, kind: str) -> None:
+    def test_gradients_are_finite(self, kind):
         image = images(kind).requires_grad_()
         histogram_of_oriented_gradients(image).square().sum().backward()
         assert image.grad is not None
         assert bool(image.grad.isfinite().all())
 
-    def test_gradcheck(self) -> None:
+    def test_gradcheck(self):
         image = images("random")[:1, :, :12, :12].contiguous().requires_grad_()
         assert gradcheck(
             lambda x: histogram_of_oriented_gradients(x, 9, (4, 4), (2, 2)), image, fast_mode=True
         )
 
-    def test_module(self) -> None:
+    def test_module(self):
         image = images("random")
         module = HistogramOfOrientedGradients(6, CELL, BLOCK, 0.3, 1e-4)
         assert torch.equal(
@@ -92,7 +91,7 @@ class TestHistogramOfOrientedGradients:
         )
         assert "num_orientations=6" in repr(module)
 
-    def test_dynamo(self) -> None:
+    def test_dynamo(self):
         image = images("random")
         graph = torch.compile(histogram_of_oriented_gradients, fullgraph=True, backend="eager")
         torch.testing.assert_close(graph(image), histogram_of_oriented_gradients(image))

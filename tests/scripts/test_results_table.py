@@ -1,14 +1,13 @@
 """The scripts that store results and write the README's table."""
 
 import json
-from pathlib import Path
 
 import pytest
 
 from scripts import _shared, results_table
 
 
-def bop_summary(*, acc_15_deg: float = 0.5, med_err_deg: float | None = 3.25) -> dict[str, object]:
+def bop_summary(*, acc_15_deg=0.5, med_err_deg=3.25):
     """A summary of ``curvireg evaluate bop`` with the keys that the tables read."""
     scores = {
         "acc_15_deg": acc_15_deg,
@@ -30,7 +29,7 @@ def bop_summary(*, acc_15_deg: float = 0.5, med_err_deg: float | None = 3.25) ->
     }
 
 
-def write_summary(folder: Path, **scores: float | None) -> Path:
+def write_summary(folder, **scores):
     folder.mkdir(parents=True)
     path = folder / "summary.json"
     path.write_text(json.dumps(bop_summary(**scores)))
@@ -38,13 +37,13 @@ def write_summary(folder: Path, **scores: float | None) -> Path:
 
 
 @pytest.fixture
-def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def results(tmp_path, monkeypatch):
     folder = tmp_path / "results"
     monkeypatch.setattr(results_table, "RESULTS", folder)
     return folder
 
 
-def test_recorded_summary_becomes_a_row_of_the_table(tmp_path: Path, results: Path) -> None:
+def test_recorded_summary_becomes_a_row_of_the_table(tmp_path, results):
     path = results_table.record(write_summary(tmp_path / "run"), "cups")
     stored = json.loads(path.read_text())
     assert path == results / "evaluation_cups.json"
@@ -57,7 +56,7 @@ def test_recorded_summary_becomes_a_row_of_the_table(tmp_path: Path, results: Pa
     assert "1 failed, 2 skipped" in table
 
 
-def test_the_table_in_words_names_what_a_set_shows(tmp_path: Path, results: Path) -> None:
+def test_the_table_in_words_names_what_a_set_shows(tmp_path, results):
     for name in ("lego", "buddha", "cups"):
         results_table.record(write_summary(tmp_path / name), name)
     sets = [{"name": "buddha", "reliable": 5, "reliable_right": 4}]
@@ -71,7 +70,7 @@ def test_the_table_in_words_names_what_a_set_shows(tmp_path: Path, results: Path
     assert list(results_table.WORDS)[-1] == "pascal3d_mini"
 
 
-def test_followed_frames_are_a_row_before_the_last(tmp_path: Path, results: Path) -> None:
+def test_followed_frames_are_a_row_before_the_last(tmp_path, results):
     for name in ("lego", "pascal3d_mini"):
         results_table.record(write_summary(tmp_path / name), name)
     videos = [
@@ -86,13 +85,13 @@ def test_followed_frames_are_a_row_before_the_last(tmp_path: Path, results: Path
     assert lines[-1] == f"Commit {', '.join(sorted((_shared.commit(), 'abc')))}."
 
 
-def test_sets_of_several_lightings_count_views(tmp_path: Path, results: Path) -> None:
+def test_sets_of_several_lightings_count_views(tmp_path, results):
     results_table.record(write_summary(tmp_path / "run"), "hope")
     assert "| hope | 8 |" in results_table.table(results)  # 8 is no multiple of 5
     assert results_table.counted("hope", 10) == "10 (2 views x 5 lightings)"
 
 
-def test_comparison_shows_stored_and_new_scores(tmp_path: Path, results: Path) -> None:
+def test_comparison_shows_stored_and_new_scores(tmp_path, results):
     results_table.record(write_summary(tmp_path / "old" / "cups"), "cups")
     new = write_summary(tmp_path / "new" / "cups", acc_15_deg=0.625, med_err_deg=None)
     text = results_table.comparison([new], results)
@@ -100,12 +99,12 @@ def test_comparison_shows_stored_and_new_scores(tmp_path: Path, results: Path) -
     assert "| cups | 8 | med_err_deg | 3.2° | - |" in text
 
 
-def test_comparison_of_a_set_that_was_never_stored(tmp_path: Path, results: Path) -> None:
+def test_comparison_of_a_set_that_was_never_stored(tmp_path, results):
     text = results_table.comparison([write_summary(tmp_path / "new" / "cups")], results)
     assert "| cups | 8 | acc_15_deg | - | 50.0 % |" in text
 
 
-def test_page_is_replaced_between_its_markers_only(tmp_path: Path) -> None:
+def test_page_is_replaced_between_its_markers_only(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
         "before\n<!-- rows:begin -->\nold\n<!-- rows:end -->\nafter\n", encoding="utf-8"
@@ -117,7 +116,7 @@ def test_page_is_replaced_between_its_markers_only(tmp_path: Path) -> None:
     )
 
 
-def test_page_without_markers_is_an_error(tmp_path: Path) -> None:
+def test_page_without_markers_is_an_error(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("text", encoding="utf-8")
     with pytest.raises(ValueError, match="substring"):

@@ -4,7 +4,6 @@ import signal
 import sys
 import unicodedata
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -217,7 +216,7 @@ def test_a_name_is_found_however_its_accents_are_stored(tmp_path, stored):
     folder.mkdir()
     file = folder / unicodedata.normalize(stored, "Stühle.png")
     file.write_text("")
-    forms: list[Any] = ["NFC", "NFD"]
+    forms = ["NFC", "NFD"]
     for form in forms:
         typed = (
             tmp_path

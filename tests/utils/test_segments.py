@@ -16,7 +16,7 @@ def table(seed):
 
 def ordered(scores, segment):
     """The rows of each segment that has some, best first."""
-    rows: dict[int, list[int]] = {}
+    rows = {}
     for row, number in enumerate(segment.tolist()):
         rows.setdefault(number, []).append(row)
     return [sorted(rows[number], key=lambda row: (-scores[row], row)) for number in sorted(rows)]

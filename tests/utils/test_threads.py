@@ -14,7 +14,7 @@ def _two_threads(threads):
 
 def test_for_each_runs_every_job_once_and_two_at_a_time():
     both = threading.Barrier(2, timeout=20)  # times out unless two jobs run at the same time
-    done: list[int] = []
+    done = []
 
     def job(number):
         both.wait()
@@ -56,7 +56,7 @@ def test_map_on_threads_keeps_the_order_on_single_threads():
 def test_threads_that_start_during_jobs_keep_the_number_of_the_process():
     """A thread takes torch's number for the process over with its first call of torch, and keeps
     it."""
-    found: list[int] = []
+    found = []
 
     def on_a_new_thread():
         thread = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
@@ -106,7 +106,7 @@ def test_a_pool_whose_threads_cannot_start_fails_at_once(monkeypatch):
 
 
 def test_jobs_that_have_not_started_are_cancelled_after_an_error():
-    done: list[int] = []
+    done = []
 
     def job(number):
         if number == 0:
@@ -120,7 +120,7 @@ def test_jobs_that_have_not_started_are_cancelled_after_an_error():
 
 
 def test_submitted_jobs_are_cancelled_after_an_error_of_the_caller():
-    done: list[int] = []
+    done = []
 
     def job(number):
         time.sleep(0.01)

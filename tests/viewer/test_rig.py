@@ -89,7 +89,7 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
         assert shot.answer is first.answer
     assert first.glb() == (tmp_path / "result" / "pose.glb").read_bytes()
     assert second.overlay() == (tmp_path / "result" / "overlay.png").read_bytes()
-    names: dict = {}
+    names = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         exec(session.python(), names)

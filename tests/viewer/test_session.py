@@ -31,7 +31,7 @@ from tests._support.scenes import scene, write_photo
 VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
 
 
-def write_scene(folder: Path, seed: int = 0) -> tuple[list[float], torch.Tensor]:
+def write_scene(folder, seed=0):
     """Write photo.png, truck.ply and small.json; returns the box and the true pose."""
     image, box, T = scene(seed)
     write_photo(folder / "photo.png", image)
@@ -43,7 +43,7 @@ def write_scene(folder: Path, seed: int = 0) -> tuple[list[float], torch.Tensor]
     return [float(v) for v in box], T
 
 
-def run_command(folder: Path, command: str) -> dict:
+def run_command(folder, command):
     """Run a command line of the viewer; returns its result."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -200,7 +200,7 @@ def test_the_python_program_gives_the_same_numbers(session, registered):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(registered[1])
         patch.setenv("CURVIREG_CACHE", str(registered[1] / "cache"))
-        names: dict = {}
+        names = {}
         program = session.python()
         exec(program, names)
     assert "None" not in program, "no defaults"

@@ -1,8 +1,6 @@
 """STEP files of a box and IGES files of a rectangle, as CAD programs write them, in several
 units."""
 
-from collections.abc import Sequence
-
 _UNITS = {
     "mm": "( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT(.MILLI.,.METRE.) )",
     "cm": "( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT(.CENTI.,.METRE.) )",
@@ -12,28 +10,28 @@ _CONVERTED = {"in": ("INCH", 25.4), "ft": ("FOOT", 304.8)}
 
 
 class _Writer:
-    def __init__(self) -> None:
+    def __init__(self):
         self.lines: list[str] = []
 
-    def add(self, text: str) -> str:
+    def add(self, text):
         self.lines.append(f"#{len(self.lines) + 1} = {text};")
         return f"#{len(self.lines)}"
 
 
-def step_file(size: Sequence[float], unit: str) -> str:
+def step_file(size, unit):
     """The text of a box with one corner at the origin."""
     w = _Writer()
     corners = [(x, y, z) for x in (0.0, size[0]) for y in (0.0, size[1]) for z in (0.0, size[2])]
     points = [w.add(f"CARTESIAN_POINT('',({x!r},{y!r},{z!r}))") for x, y, z in corners]
     vertices = [w.add(f"VERTEX_POINT('',{point})") for point in points]
-    edges: dict[tuple[int, int], str] = {}
+    edges = {}
 
-    def direction(values: Sequence[float]) -> str:
+    def direction(values):
         length = sum(v * v for v in values) ** 0.5
         x, y, z = (float(v / length) for v in values)
         return w.add(f"DIRECTION('',({x!r},{y!r},{z!r}))")
 
-    def edge(a: int, b: int) -> str:
+    def edge(a, b):
         first = min(a, b)
         second = max(a, b)
         if (first, second) not in edges:
@@ -107,7 +105,7 @@ def step_file(size: Sequence[float], unit: str) -> str:
     return head + "\n".join(w.lines) + "\nENDSEC;\nEND-ISO-10303-21;\n"
 
 
-def iges_file(size: Sequence[float], flag: int, name: str) -> str:
+def iges_file(size, flag, name):
     """The text of a rectangle at the origin: a ruled surface between two lines. ``flag`` is that of
     the unit."""
     parameters = [

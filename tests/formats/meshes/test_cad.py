@@ -6,8 +6,6 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,15 +25,13 @@ Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 BOX = trimesh.creation.box((30.0, 20.0, 10.0))
 
 
-def needs(package: str) -> pytest.MarkDecorator:
+def needs(package):
     return pytest.mark.skipif(not is_installed(package), reason=f"{package} is not installed")
 
 
 @needs("cascadio")
 @pytest.mark.parametrize(("unit", "suffix"), [("cm", "step"), ("in", "STP")])
-def test_step_files_keep_their_unit_and_axes(
-    tmp_path: Path, load: Load, unit: str, suffix: str
-) -> None:
+def test_step_files_keep_their_unit_and_axes(tmp_path, load, unit, suffix):
     path = tmp_path / f"part.{suffix}"
     path.write_text(step_file((3.0, 2.0, 1.0), unit))
     mesh, texts = load(path)
@@ -50,9 +46,7 @@ def test_step_files_keep_their_unit_and_axes(
 
 @needs("cascadio")
 @pytest.mark.parametrize(("flag", "name", "unit"), [(2, "MM", "mm"), (1, "IN", "in")])
-def test_iges_files_keep_their_unit(
-    tmp_path: Path, load: Load, flag: int, name: str, unit: str
-) -> None:
+def test_iges_files_keep_their_unit(tmp_path, load, flag, name, unit):
     (tmp_path / "part.igs").write_text(iges_file((3.0, 2.0), flag, name))
     mesh, _ = load(tmp_path / "part.igs")
     assert mesh.units == unit
@@ -70,16 +64,14 @@ def test_iges_files_keep_their_unit(
         b"ISO-10303-21;" * 999,
     ],
 )
-def test_damaged_step_files_are_refused(tmp_path: Path, content: bytes) -> None:
+def test_damaged_step_files_are_refused(tmp_path, content):
     (tmp_path / "part.step").write_bytes(content)
     with pytest.raises(MeshError, match=r"part\.step: cannot be read as a mesh"):
         cr.load_mesh(tmp_path / "part.step")
 
 
 @needs("cascadio")
-def test_step_files_are_bounded_in_size_and_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_step_files_are_bounded_in_size_and_time(tmp_path, monkeypatch):
     path = tmp_path / "part.step"
     path.write_text(step_file((3.0, 2.0, 1.0), "mm"))
     for name, value, match in (
@@ -96,9 +88,7 @@ def test_step_files_are_bounded_in_size_and_time(
 @pytest.mark.parametrize(
     ("suffix", "package"), [("step", "cascadio"), ("igs", "cascadio"), ("dae", "collada")]
 )
-def test_the_message_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, package: str
-) -> None:
+def test_the_message_names_the_extra(tmp_path, monkeypatch, suffix, package):
     monkeypatch.setattr(extras, "find_spec", lambda _: None)
     (tmp_path / f"a.{suffix}").write_text("a part")
     with pytest.raises(MissingDependencyError, match=package) as caught:
@@ -110,7 +100,7 @@ def test_the_message_names_the_extra(
 
 
 @pytest.mark.slow
-def test_the_extra_is_loaded_only_when_needed(tmp_path: Path) -> None:
+def test_the_extra_is_loaded_only_when_needed(tmp_path):
     BOX.export(tmp_path / "a.stl")
     code = "import sys, curvireg_torch as cr; cr.load_mesh(sys.argv[1], unit='mm'); "
     code += "print('collada' in sys.modules)"  # trimesh itself imports cascadio
@@ -135,17 +125,17 @@ def test_the_extra_is_loaded_only_when_needed(tmp_path: Path) -> None:
         ("9999H", None),
     ],
 )
-def test_the_unit_of_an_iges_file(parameters: str, unit: str | None) -> None:
+def test_the_unit_of_an_iges_file(parameters, unit):
     lines = [f"{'part':<72}S      1", *_records(parameters)]
     assert cad.iges_unit("\n".join(lines).encode()) == unit
 
 
-def _records(text: str) -> list[str]:
+def _records(text):
     return [f"{text[k : k + 72]:<72}G{k // 72 + 1:7d}" for k in range(0, len(text), 72)]
 
 
 @pytest.mark.parametrize("prefix", [".MILLI.", ".MICRO.", "$"])
-def test_the_unit_of_a_step_file_is_that_of_its_context(prefix: str) -> None:
+def test_the_unit_of_a_step_file_is_that_of_its_context(prefix):
     """The base of a converted unit is none itself."""
     text = step_file((3.0, 2.0, 1.0), "in")
     assert cad.step_unit(text.encode()) == "in"
@@ -181,7 +171,7 @@ COLLADA = """<?xml version="1.0"?>
 """  # noqa: E501
 
 
-def collada(asset: str = "", image: str = "label.png", nodes: str = "", more: str = "") -> str:
+def collada(asset="", image="label.png", nodes="", more=""):
     return COLLADA.format(asset=asset, image=image, nodes=nodes, more=more)
 
 
@@ -195,9 +185,7 @@ def collada(asset: str = "", image: str = "label.png", nodes: str = "", more: st
         ("", "m", "y", 1.0),
     ],
 )
-def test_collada_files_keep_their_unit_and_axes(
-    tmp_path: Path, load: Load, asset: str, unit: str, up: str, scale: float
-) -> None:
+def test_collada_files_keep_their_unit_and_axes(tmp_path, load, asset, unit, up, scale):
     (tmp_path / "a.dae").write_text(collada(asset))
     pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "label.png")
@@ -212,7 +200,7 @@ def test_collada_files_keep_their_unit_and_axes(
 
 
 @needs("collada")
-def test_collada_names_textures_that_it_cannot_use(tmp_path: Path, load: Load) -> None:
+def test_collada_names_textures_that_it_cannot_use(tmp_path, load):
     (tmp_path / "label.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
     for image, match in (
         ("no.png", "no.png is missing"),
@@ -226,7 +214,7 @@ def test_collada_names_textures_that_it_cannot_use(tmp_path: Path, load: Load) -
 
 
 @needs("collada")
-def test_hostile_collada_files_are_refused(tmp_path: Path) -> None:
+def test_hostile_collada_files_are_refused(tmp_path):
     nodes = "".join(
         f'<node id="n{k}">' + f'<instance_node url="#n{k + 1}"/>' * 10 + "</node>"
         for k in range(20)
@@ -253,13 +241,13 @@ def test_hostile_collada_files_are_refused(tmp_path: Path) -> None:
 
 
 def threemf(
-    path: Path,
-    resources: str,
-    items: str,
+    path,
+    resources,
+    items,
     *,
-    unit: str = 'unit="inch"',
-    more: dict[str, bytes] | None = None,
-) -> Path:
+    unit='unit="inch"',
+    more=None,
+):
     namespace = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
     text = (
         f'<?xml version="1.0"?><model {unit} xmlns="{namespace}" xmlns:m="materials" '
@@ -273,7 +261,7 @@ def threemf(
     return path
 
 
-def solid(number: int, attributes: str = "", triangle: str = "") -> str:
+def solid(number, attributes="", triangle=""):
     vertices = "".join('<vertex x="{:g}" y="{:g}" z="{:g}"/>'.format(*v) for v in BOX.vertices)
     faces = "".join(
         f'<triangle v1="{a}" v2="{b}" v3="{c}" {triangle if k < 6 else ""}/>'
@@ -283,7 +271,7 @@ def solid(number: int, attributes: str = "", triangle: str = "") -> str:
     return f'<object id="{number}" type="model" {attributes}>{mesh}</object>'
 
 
-def test_threemf_names_shapes_that_are_left_out(tmp_path: Path, load: Load) -> None:
+def test_threemf_names_shapes_that_are_left_out(tmp_path, load):
     lattice = "<b:beamlattice><b:beams/></b:beamlattice></mesh>"
     resources = solid(1).replace("</mesh>", lattice).replace("<object", '<object xmlns:b="beams"')
     mesh, texts = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))
@@ -293,7 +281,7 @@ def test_threemf_names_shapes_that_are_left_out(tmp_path: Path, load: Load) -> N
     ]
 
 
-def test_threemf_places_objects_and_their_components(tmp_path: Path, load: Load) -> None:
+def test_threemf_places_objects_and_their_components(tmp_path, load):
     components = (
         '<component objectid="1" transform="0 1 0 -1 0 0 0 0 1 100 0 0"/><component objectid="1"/>'
     )
@@ -314,7 +302,7 @@ def test_threemf_places_objects_and_their_components(tmp_path: Path, load: Load)
         assert (mesh.units, mesh.extents[0]) == (name, pytest.approx(30.0 * scale))
 
 
-def test_threemf_leaves_out_what_is_not_the_object(tmp_path: Path, load: Load) -> None:
+def test_threemf_leaves_out_what_is_not_the_object(tmp_path, load):
     """Supports, items that are not printed, and copies on the build plate."""
     resources = solid(1) + solid(2).replace('type="model"', 'type="support"')
     resources += solid(3).replace('type="model"', 'type="solidsupport"') + solid(4)
@@ -339,7 +327,7 @@ def test_threemf_leaves_out_what_is_not_the_object(tmp_path: Path, load: Load) -
     assert "2 objects on its build plate are read as one rigid body" in texts[0]
 
 
-def test_threemf_reads_colours_and_textures(tmp_path: Path, load: Load) -> None:
+def test_threemf_reads_colours_and_textures(tmp_path, load):
     base = (
         '<basematerials id="5"><base name="a" displaycolor="#FF0000"/><base name="b" '
         'displaycolor="#0000FFFF"/>'
@@ -400,13 +388,13 @@ def test_threemf_reads_colours_and_textures(tmp_path: Path, load: Load) -> None:
     )
 
 
-def test_an_axis_that_is_given_comes_before_that_of_the_file(tmp_path: Path) -> None:
+def test_an_axis_that_is_given_comes_before_that_of_the_file(tmp_path):
     path = threemf(tmp_path / "a.3mf", solid(1), '<item objectid="1"/>')
     assert mesh_up(cr.load_mesh(path)) == "z"
     assert mesh_up(cr.load_mesh(path, up="-y")) == "-y"
 
 
-def test_threemf_of_several_models(tmp_path: Path, load: Load) -> None:
+def test_threemf_of_several_models(tmp_path, load):
     inner = threemf(tmp_path / "inner.3mf", solid(3), "")
     with zipfile.ZipFile(inner) as archive:
         content = archive.read("3D/3dmodel.model")
@@ -419,7 +407,7 @@ def test_threemf_of_several_models(tmp_path: Path, load: Load) -> None:
     assert mesh.extents.tolist() == [30.0, 20.0, 10.0]
 
 
-def test_hostile_threemf_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_threemf_files_are_refused(tmp_path, monkeypatch):
     path = tmp_path / "a.3mf"
     circle = '<object id="1"><components><component objectid="1"/></components></object>'
     many = "".join(
@@ -464,7 +452,7 @@ rpy="0 1.5707963267948966 0"/></joint>
 """  # noqa: E501
 
 
-def robot(folder: Path, base: str = "package://arm/meshes/base.stl") -> Path:
+def robot(folder, base="package://arm/meshes/base.stl"):
     (folder / "meshes").mkdir(exist_ok=True, parents=True)
     trimesh.creation.box((3.0, 2.0, 1.0)).export(folder / "meshes" / "base.stl")
     BOX.export(folder / "meshes" / "tip.ply")
@@ -473,7 +461,7 @@ def robot(folder: Path, base: str = "package://arm/meshes/base.stl") -> Path:
     return path
 
 
-def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path: Path, load: Load) -> None:
+def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path, load):
     mesh, texts = load(robot(tmp_path))
     assert (mesh.units, mesh_up(mesh), texts) == ("m", "z", [])
     # The tip's box of 0.3 x 0.2 x 0.1 is turned about z, lies 0.5 along z, and z is turned to x.
@@ -492,7 +480,7 @@ def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path: Path, load: Load
         cr.load_mesh(tmp_path / "meshes" / "base.stl", link="tip")
 
 
-def test_urdf_names_meshes_that_it_does_not_find(tmp_path: Path, load: Load) -> None:
+def test_urdf_names_meshes_that_it_does_not_find(tmp_path, load):
     path = robot(tmp_path / "urdf", "package://arm/other/base.stl")
     assert "other/base.stl is missing in its folder" in load(path)[1][0]
     (tmp_path / "other").mkdir()
@@ -514,8 +502,8 @@ def test_urdf_names_meshes_that_it_does_not_find(tmp_path: Path, load: Load) -> 
     ],
 )
 def test_meshes_of_a_package_are_found_from_its_folder_urdf(
-    tmp_path: Path, load: Load, place: str, names_package: bool | str, is_found: bool
-) -> None:
+    tmp_path, load, place, names_package, is_found
+):
     folder = tmp_path / place
     folder.mkdir(parents=True)
     (folder.parent / "meshes").mkdir()
@@ -534,7 +522,7 @@ def test_meshes_of_a_package_are_found_from_its_folder_urdf(
         cr.load_mesh(path)
 
 
-def test_hostile_urdf_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_urdf_files_are_refused(tmp_path, monkeypatch):
     path = robot(tmp_path)
     text = path.read_text()
     joint = '<joint name="l" type="fixed"><parent link="ball"/><child link="base"/></joint></robot>'
@@ -556,7 +544,7 @@ def test_hostile_urdf_files_are_refused(tmp_path: Path, monkeypatch: pytest.Monk
         cr.load_mesh(path)
 
 
-def test_a_mirrored_part_keeps_its_outside(tmp_path: Path) -> None:
+def test_a_mirrored_part_keeps_its_outside(tmp_path):
     path = robot(tmp_path)
     path.write_text(path.read_text().replace('scale="0.01 0.01 0.01"', 'scale="0.01 -0.01 0.01"'))
     assert cr.load_mesh(path, link="tip").volume == pytest.approx(0.006)
@@ -564,7 +552,7 @@ def test_a_mirrored_part_keeps_its_outside(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @needs("cascadio")
-def test_register_takes_the_unit_of_a_step_file(tmp_path: Path) -> None:
+def test_register_takes_the_unit_of_a_step_file(tmp_path):
     """As a user does: a photograph, a STEP file and a box; the mesh is in the file's
     millimetres."""
     from curvireg_torch.cli import main
@@ -604,7 +592,7 @@ def test_register_takes_the_unit_of_a_step_file(tmp_path: Path) -> None:
         str(tmp_path / "out"),
     ]
     assert main(words) in (None, 0)
-    document: dict[str, Any] = json.loads((tmp_path / "out" / "result.json").read_text())
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
     assert document["unit"] == "mm"
     assert document["translation"][2] == pytest.approx(T[2, 3], rel=0.2)
     assert math.isclose(document["translation"][2], 300, rel_tol=0.3)

@@ -56,7 +56,7 @@ class Tree:
         return len(self.content["accessors"]) - 1
 
     def part(self, indices=None, positions=BOX.vertices, **more):
-        part: dict[str, Any] = {"attributes": {"POSITION": self.array(positions)}, **more}
+        part = {"attributes": {"POSITION": self.array(positions)}, **more}
         if indices is not None:
             part["indices"] = self.array(np.ravel(indices), "I")
         self.content["meshes"][0]["primitives"].append(part)

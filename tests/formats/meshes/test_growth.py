@@ -146,7 +146,7 @@ def test_bytes_of_a_shared_image_are_made_once(tmp_path, monkeypatch):
     decode = Mock(wraps=gltf._data_of)
     monkeypatch.setattr(gltf, "_data_of", decode)
     view = gltf._File._view
-    viewed: list[int] = []
+    viewed = []
 
     def noted(self, index):
         viewed.append(index)
@@ -270,7 +270,7 @@ def test_a_texture_of_many_groups_is_unpacked_once(tmp_path, monkeypatch):
         tmp_path / "a.3mf", resources, '<item objectid="1"/>', more={"3D/a.png": picture()}
     )
     content = threemf._Package._content
-    asked: list[str] = []
+    asked = []
 
     def noted(self, name):
         asked.append(name)

@@ -40,8 +40,7 @@ def first_corners(mesh):
     """The colours of the first corner of each face."""
     colours = surface_colours(mesh)
     assert colours is not None
-    found: list[list[int]] = colours.corners[:, 0].tolist()
-    return found
+    return colours.corners[:, 0].tolist()
 
 
 def textures(mesh):
