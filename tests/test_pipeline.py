@@ -108,7 +108,7 @@ def test_json_contains_every_setting():
     for pipeline in changed:
         assert Pipeline.from_json(pipeline.to_json()) == pipeline
     with pytest.raises(FrozenInstanceError):
-        base.box_jitter = 0.0  # type: ignore[misc]
+        base.box_jitter = 0.0
 
 
 def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_mistake(tmp_path):

@@ -75,8 +75,8 @@ def check_pose(document, T, degrees, share):
     R, t = (
         torch.tensor(document[name], dtype=torch.float64) for name in ("rotation", "translation")
     )
-    assert float(rotation_error(R, T[:3, :3])) < degrees
-    assert float((t - T[:3, 3]).norm() / T[:3, 3].norm()) < share
+    assert rotation_error(R, T[:3, :3]) < degrees
+    assert ((t - T[:3, 3]).norm() / T[:3, 3].norm()) < share
 
 
 def lines(folder):

@@ -77,7 +77,7 @@ def test_register_upright_mesh_with_another_up_axis(
     example_mesh().apply_transform(T).export(folder / name)
     assert register_one("--pose", "upright", "--no-refine", *options, mesh=name) == 0
     found = torch.tensor(document()["rotation"]).double()
-    assert float(rotation_error(found, scene(0)[2][:3, :3] @ up_rotation(up))) < 15
+    assert rotation_error(found, scene(0)[2][:3, :3] @ up_rotation(up)) < 15
 
 
 def test_an_upright_mesh_that_is_not_recognised_is_told_which_axis_was_taken_as_up(
@@ -280,7 +280,7 @@ def test_starts_of_other_tools_have_their_convention_and_unit(
     )
     refused(register_one(*words, box=()), f"behind the camera: {message}")
     assert register_one(*words, "--start-convention", "opengl", box=()) == 0
-    assert float(rotation_error(torch.tensor(document()["rotation"]).double(), T[:3, :3])) < 3.0
+    assert rotation_error(torch.tensor(document()["rotation"]).double(), T[:3, :3]) < 3.0
     entry = {
         "cam_R_m2c": T[:3, :3].flatten().tolist(),
         "cam_t_m2c": (1000.0 * T[:3, 3]).tolist(),
@@ -321,9 +321,7 @@ def test_register_refines_a_start_or_writes_that_the_object_is_lost(
     words = "--start", str(path), "--camera", *CAMERA
     assert register_one(*words, box=()) == 0
     result = document()
-    assert (
-        float(rotation_error(torch.tensor(result["rotation"]).double(), scene(0)[2][:3, :3])) < 3.0
-    )
+    assert rotation_error(torch.tensor(result["rotation"]).double(), scene(0)[2][:3, :3]) < 3.0
     assert set(result["confidence_features"]) == {"similarity", "edge_support"}
     pose["translation"][0] += 100.0
     path.write_text(json.dumps(pose))

@@ -42,8 +42,8 @@ def test_default_collate_takes_the_crops(dataset, workers):
         "viewpoint_bins": (torch.int64, (3,)),
         "class_id": (torch.int64, ()),
     }
-    assert float(batch["image"].min()) >= 0.0
-    assert float(batch["image"].max()) <= 1.0
+    assert batch["image"].min() >= 0.0
+    assert batch["image"].max() <= 1.0
 
 
 def test_crops_show_the_boxes_with_their_poses_and_classes(tmp_path):

@@ -120,7 +120,7 @@ def test_results_are_the_same_bits_on_other_threads_and_agree_resumed(pascal, tm
         assert resumed[key]["verdict"] == row["verdict"]
     for key in scored:
         rotations = [torch.tensor(rows[key]["rotation"]) for rows in (one, resumed)]
-        assert float(rotation_error(*rotations)) < 0.05
+        assert rotation_error(*rotations) < 0.05
         assert resumed[key]["confidence"] == pytest.approx(one[key]["confidence"], abs=0.01)
 
 

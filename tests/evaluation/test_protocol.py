@@ -48,10 +48,10 @@ def test_hint_of_truth_holds_the_truth_and_is_off_centre(hint):
     missed = torch.stack(
         [hint_of_truth(r, frame, protocol, str(i)).excess(r, frame) for i, r in enumerate(R)]
     )
-    assert float(missed.max()) <= 0.0
-    assert float(missed.min()) >= -degrees
-    assert float(missed.std()) > 0.15 * degrees
-    assert float(missed.max()) > -0.25 * degrees, "offsets fill the range"
+    assert missed.max() <= 0.0
+    assert missed.min() >= -degrees
+    assert missed.std() > 0.15 * degrees
+    assert missed.max() > -0.25 * degrees, "offsets fill the range"
     assert hint_of_truth(R[0], frame, protocol, "a") == hint_of_truth(R[0], frame, protocol, "a")
     assert hint_of_truth(R[0], frame, protocol, "a") != hint_of_truth(
         R[0], frame, replace(protocol, seed=1), "a"

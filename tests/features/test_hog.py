@@ -66,14 +66,14 @@ def test_hog_suppresses_blocks_far_below_the_strongest():
     field[:, 0, :32] = 1.0
     field[:, 1, 32:] = 1e-13  # rounding
     lengths = hog(field).view(7, 7, 36).norm(dim=-1)
-    assert float(lengths[:3].min()) > 0.99
-    assert float(lengths[5:].max()) < 0.01
+    assert lengths[:3].min() > 0.99
+    assert lengths[5:].max() < 0.01
 
 
 def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt():
     field = torch.randn(2, 2, 32, 32, generator=torch.Generator().manual_seed(1))
     without = hog(field, bin_weights=torch.tensor([0.0, *[1.0] * 8]))
-    assert float(without.view(2, -1, 9)[..., 0].abs().max()) == 0.0
+    assert without.view(2, -1, 9)[..., 0].abs().max() == 0.0
     module = features.HOG(learnable=True)
     torch.testing.assert_close(module(field), hog(field))
     module(field)[:, ::9].sum().backward()
@@ -89,9 +89,8 @@ def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt():
     with torch.no_grad():
         weights = module.bin_weights
         out = module(field)
-    assert weights is not None
-    assert 0.0 < float(weights.min()) < 0.1  # a step of the weights themselves leads to -2.5
-    assert float(out.min()) >= 0.0
+    assert 0.0 < weights.min() < 0.1  # a step of the weights themselves leads to -2.5
+    assert out.min() >= 0.0
 
 
 def test_hog_rejects_wrong_weights_and_grids():
@@ -125,7 +124,7 @@ def test_field_points_of_a_ridge_are_a_thin_line(angle, sign):
     points = (field_points(field, fraction=1.0) & (field.norm(dim=1, keepdim=True) > 0.5))[0, 0]
     y, x = (points.nonzero().T - 20).float()
     a = torch.tensor(angle).deg2rad()
-    assert float((x * torch.cos(a) + y * torch.sin(a)).abs().max()) <= 0.75
+    assert (x * torch.cos(a) + y * torch.sin(a)).abs().max() <= 0.75
     longest = 41 if angle in (0.0, 90.0, 45.0, 135.0) else 35
     assert longest - 6 <= len(x) <= 81  # a diagonal is a staircase
 
@@ -140,9 +139,9 @@ def test_field_points_fraction_selects_the_longest_of_each_image(seed, fraction)
     length = field.norm(dim=1, keepdim=True)
     for p, e, v in zip(points, every, length, strict=True):
         assert int(p.sum()) == min(max(1, int(fraction * 576)), int(e.sum()))
-        assert bool((p <= e).all())
+        assert (p <= e).all()
         if bool((e & ~p).any()):
-            assert float(v[p].min()) >= float(v[e & ~p].max())
+            assert v[p].min() >= v[e & ~p].max()
 
 
 def test_field_points_of_a_ridge_two_pixels_wide_are_one_pixel_wide():

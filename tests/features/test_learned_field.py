@@ -152,10 +152,10 @@ def test_fields_fill_missing_pixels():
     where = filters.operations.missing_mask(lost).any(dim=1, keepdim=True)
     learned = cr.LearnedCurvilinearSaliency()
     field = learned(lost)
-    assert bool(field.isfinite().all())
-    assert not bool(field.masked_select(where).any())
-    assert bool(field.masked_select(~where).any())
-    assert bool(learned.mask(lost).isfinite().all())
+    assert field.isfinite().all()
+    assert not field.masked_select(where).any()
+    assert field.masked_select(~where).any()
+    assert learned.mask(lost).isfinite().all()
     appearance_scores = describe(torch.cat([image, lost]), Backbone())
-    assert bool(appearance_scores.isfinite().all())
-    assert 0.5 < float((appearance_scores[0].float() * appearance_scores[1].float()).sum()) < 0.9999
+    assert appearance_scores.isfinite().all()
+    assert 0.5 < (appearance_scores[0].float() * appearance_scores[1].float()).sum() < 0.9999

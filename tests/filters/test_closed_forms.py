@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from curvireg_torch import filters
+from tests._support.numbers import double
 
 from .layer_cases import cylinder, grid, plane, sphere
 
@@ -49,7 +50,7 @@ def test_depth_curvilinear_saliency_converges_with_order_two():
         errors = torch.tensor([error(size) for size in SIZES])
         orders = -errors.log().diff() / torch.tensor(SIZES).log().diff()
         assert errors[-1] < 1e-3
-        assert bool(((orders > 1.8) & (orders < 2.3)).all())
+        assert ((orders > 1.8) & (orders < 2.3)).all()
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 2.0])
@@ -63,8 +64,8 @@ def test_depth_layers_are_zero_on_a_plane_up_to_the_border(sigma, slopes):
         filters.average_shading_gradient,
     ):
         for depth_scale in (1.0, None):
-            assert float(layer(depth, sigma=sigma, depth_scale=depth_scale).abs().max()) < 1e-9
-    assert float(filters.apparent_ridges(depth, sigma=sigma, maxima=False).abs().max()) < 1e-9
+            assert layer(depth, sigma=sigma, depth_scale=depth_scale).abs().max() < 1e-9
+    assert filters.apparent_ridges(depth, sigma=sigma, maxima=False).abs().max() < 1e-9
 
 
 def test_depth_curvilinear_saliency_formulas_differ_by_the_metric():
@@ -108,7 +109,7 @@ def test_average_shading_gradient_of_a_sphere():
 
 def _camera(focal, size):
     c = (size - 1) / 2
-    return torch.tensor([[focal, 0.0, c], [0.0, focal, c], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return double([[focal, 0.0, c], [0.0, focal, c], [0.0, 0.0, 1.0]])
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
@@ -120,14 +121,12 @@ def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_
     W = 61
     d = 5.0
     r = 2.0
-    camera = torch.tensor(
-        [[130.0, 0.0, 24.0], [0.0, 90.0, 31.0], [0.0, 0.0, 1.0]], dtype=torch.float64
-    )
+    camera = double([[130.0, 0.0, 24.0], [0.0, 90.0, 31.0], [0.0, 0.0, 1.0]])
 
     def surface(u, v):
         """Depth and normals (3, ...) at pixels u, v, of a sphere around (0.2, -0.1, d)."""
         ray = torch.stack([(u - 24.0) / 130.0, (v - 31.0) / 90.0, torch.ones_like(u)])
-        centre = torch.tensor([0.2, -0.1, d], dtype=torch.float64).view(3, 1, 1)
+        centre = double([0.2, -0.1, d]).view(3, 1, 1)
         a = (ray * ray).sum(0)
         b = (ray * centre).sum(0)
         z = (b - (b * b - a * ((centre * centre).sum() - r * r)).sqrt()) / a
@@ -154,9 +153,7 @@ def test_hessian_frobenius_norm_of_a_quadratic():
     z = (900.0 + 0.5 * x**2 + 2.0 * x * y - 1.5 * y**2)[None, None]
     field = filters.hessian_frobenius_norm(z, sigma=0.0, depth_scale=1.0)[0, :, 1:-1, 1:-1]
     torch.testing.assert_close(field.norm(dim=0), torch.full_like(field[0], math.sqrt(1 + 8 + 9)))
-    values, vectors = torch.linalg.eigh(
-        torch.tensor([[1.0, 2.0], [2.0, -3.0]], dtype=torch.float64)
-    )
+    values, vectors = torch.linalg.eigh(double([[1.0, 2.0], [2.0, -3.0]]))
     along = vectors[:, values.abs().argmax()]
     torch.testing.assert_close((field[:, 3, 3] / field[:, 3, 3].norm()).abs(), along.abs())
 
@@ -201,7 +198,7 @@ def test_depth_layers_ignore_noise_of_one_ulp(field, distance):
     # the sign of each vector is arbitrary
     a = FIELDS[field](noisy).double()
     b = FIELDS[field](depth).double()
-    assert float((a * b).sum(dim=1).abs().sum() / (a.norm() * b.norm())) > 0.9999
+    assert ((a * b).sum(dim=1).abs().sum() / (a.norm() * b.norm())) > 0.9999
 
 
 def test_multiscale_focus_curves_rank_edges_by_sharpness():
@@ -226,7 +223,7 @@ def test_multiscale_focus_curves_leave_weak_edges_out():
     default = filters.multiscale_focus_curves(image)[0, :, 80].norm(dim=0)
     every = filters.multiscale_focus_curves(image, threshold=0.001)[0, :, 80].norm(dim=0)
     assert [bool(default[i] > 0) for i in (30, 80, 130)] == [True, True, False]
-    assert bool((every[[30, 80, 130]] > 0).all())
+    assert (every[[30, 80, 130]] > 0).all()
     torch.testing.assert_close(default[[30, 80]], every[[30, 80]])
 
 
@@ -236,6 +233,6 @@ def test_principal_curvature_image_of_a_dark_line():
     field = filters.principal_curvature_image(1 - bright)[0, :, 32]
     assert int(field.norm(dim=0).argmax()) == 32
     # s^2 2 / (4 + s^2)^1.5 is largest at s = 2 sqrt 2, so the scale of 2.8 px has the maximum.
-    assert float(field[:, 32].norm()) == pytest.approx(2.8**2 * 2 / (4 + 2.8**2) ** 1.5, rel=0.03)
-    assert float(field[1, 32].abs()) < 1e-9
-    assert float(filters.principal_curvature_image(bright)[0, :, 32, 32].norm()) < 1e-9
+    assert field[:, 32].norm() == pytest.approx(2.8**2 * 2 / (4 + 2.8**2) ** 1.5, rel=0.03)
+    assert field[1, 32].abs() < 1e-9
+    assert filters.principal_curvature_image(bright)[0, :, 32, 32].norm() < 1e-9

@@ -33,10 +33,10 @@ def test_photo_layers_fill_missing_pixels(layer, value):
     assert torch.isfinite(y).all()
     torch.testing.assert_close(y[1], clean[1], rtol=0.0, atol=0.0)
     if not layer.name.startswith("diffusion"):
-        assert bool((y[0, :, 5, 7] == missing_value(layer)).all())
+        assert (y[0, :, 5, 7] == missing_value(layer)).all()
     # Beyond the reach of the kernels only normalisations by the maximum of the image can change.
     far = (y - clean)[0, :, 30:, 30:].abs()
-    assert float((far > 1e-6 * clean.abs().max()).float().mean()) < 0.02
+    assert (far > 1e-6 * clean.abs().max()).float().mean() < 0.02
     y.square().sum().backward()
     assert broken.grad is not None
     assert torch.isfinite(broken.grad).all()
@@ -53,15 +53,15 @@ def test_fill_missing_uses_the_surroundings():
         holes[..., 20 : 20 + size, 30 : 30 + size] = True
         filled = fill_missing(ramp.masked_fill(holes, math.nan))
         assert torch.equal(filled[~holes], ramp[~holes])
-        assert float((filled - ramp)[holes].abs().max()) <= 2 * size
+        assert (filled - ramp)[holes].abs().max() <= 2 * size
         gradient = filters.image_gradient(ramp.masked_fill(holes, math.nan))[..., 5:-5, 5:-5].norm(
             dim=1
         )
-        assert float(gradient.max()) < 2.5
+        assert gradient.max() < 2.5
     large = torch.zeros_like(ramp, dtype=torch.bool)
     large[..., :, 30:] = True  # outside of what is valid: the nearest pixel, as at the border
     filled = fill_missing(ramp.masked_fill(large, math.nan), large)
-    assert bool((filled[..., 30:] == 29.0).all())
+    assert (filled[..., 30:] == 29.0).all()
 
 
 @pytest.mark.filterwarnings("ignore:There is a performance drop")
@@ -121,10 +121,10 @@ def test_gradient_penalties_are_finite_where_images_are_flat(layer, dtype):
         x = image.clone().requires_grad_()
         y = layer(x)
         (slope,) = torch.autograd.grad(y.square().sum() + y.sum(), x, create_graph=True)
-        assert bool(torch.isfinite(slope).all())
+        assert torch.isfinite(slope).all()
         if slope.requires_grad:
             (curvature,) = torch.autograd.grad(slope.square().sum(), x)
-            assert bool(torch.isfinite(curvature).all())
+            assert torch.isfinite(curvature).all()
 
 
 @every_photo_layer

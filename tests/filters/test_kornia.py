@@ -9,6 +9,7 @@ from curvireg_torch.filters import operations as ops
 from scripts._shared import read_json
 from scripts.speed import kornia_layers as script
 from scripts.speed.kornia_layers import LAYERS, LIMIT, computed, image_of, table
+from tests._support.numbers import double
 
 
 def smoothed(sigma, **options):
@@ -18,9 +19,9 @@ def smoothed(sigma, **options):
 PRIMITIVES = {
     **{f"sigma {s}": smoothed(s) for s in (0.0, 0.3, 1.0, 2.5, 6.0)},
     "no margin": smoothed(1.3, margin=0),
-    "tensor": smoothed(torch.tensor(1.7, dtype=torch.float64)),
-    "large tensor": smoothed(torch.tensor(6.0, dtype=torch.float64)),
-    "tensor of zero": smoothed(torch.tensor(0.0, dtype=torch.float64)),
+    "tensor": smoothed(double(1.7)),
+    "large tensor": smoothed(double(6.0)),
+    "tensor of zero": smoothed(double(0.0)),
     # the script's of kornia, the library's never
     "first": lambda x: torch.cat(ops.central_gradient(x), dim=1),
 }
@@ -55,7 +56,7 @@ def test_layers_are_the_same_by_both(name):
     off = torch.minimum((fields[0] - fields[1]).abs(), (fields[0] + fields[1]).abs())
     large = off > 1e-4 * fields[0].abs().max()
     # single pixels lie at a threshold, or are one of two equal maxima
-    assert float(large.float().mean()) < 0.002
+    assert large.float().mean() < 0.002
 
 
 def kornia_calls(monkeypatch):

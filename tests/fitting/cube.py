@@ -9,6 +9,7 @@ from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.registration import fit_contours
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
+from tests._support.numbers import double
 
 K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)
 BOX = torch.tensor([40.0, 36, 88, 84])
@@ -20,8 +21,8 @@ def cube():
 
 def pose(axis_angle, position):
     """(4, 4) of a rotation in rad and a position."""
-    R = rotation_from_axis_angle(torch.tensor(axis_angle, dtype=torch.float64))
-    return transform(R, torch.tensor(position, dtype=torch.float64))
+    R = rotation_from_axis_angle(double(axis_angle))
+    return transform(R, double(position))
 
 
 CUBE_POSE = pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])

@@ -13,9 +13,10 @@ from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import synthesize_photograph
+from tests._support.numbers import double
 from tests._support.scenes import CAMERA, SIZE
 
-TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+TURN = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
 
 
 @cache
@@ -61,15 +62,15 @@ def test_few_points_of_difference_weigh_less(monkeypatch):
     assert 0.0 < float(fewer[0, 1]) < 1e-2 * float(scores[0, 1])
     monkeypatch.setattr(details, "MIN_POINTS", 10**6)
     scores, differ = compared()
-    assert not bool(differ.any())
-    assert not bool(scores.any())
+    assert not differ.any()
+    assert not scores.any()
 
 
 def test_the_middle_between_a_contour_and_none_is_half_of_what_shared_contours_have():
     """A pose beside the true one has contours where the photograph has none: they count against
     it, though the background has some texture."""
     scores, differ = compared(wrong=0.25)
-    assert bool(differ[0, 2])
+    assert differ[0, 2]
     assert float(scores[2, 0]) < -1.0
 
 
@@ -78,7 +79,7 @@ def test_what_lies_outside_the_photograph_does_not_count(monkeypatch):
     scores, _ = compared(shift=-1.9)
     monkeypatch.setattr(EdgeField, "counts", lambda _, __, valid, ___: valid)
     everything, _ = compared(shift=-1.9)
-    assert float((scores - everything).abs().max()) > 0.05
+    assert (scores - everything).abs().max() > 0.05
 
 
 def test_contours_that_are_not_there_count_against_their_pose():
@@ -92,13 +93,13 @@ def test_contours_that_are_not_there_count_against_their_pose():
         box_alone, T, CAMERA, SIZE, generator, background=background, texture=0.0
     )
     crops = EdgeCrops.cut([image], box[None], 0.3)
-    below = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    below = torch.diag(double([1.0, -1.0, -1.0, 1.0]))
     index = torch.zeros(2, dtype=torch.long)
     contours = MeshContours(marked_box())
     scores, differ = details.compare_details(
         contours, crops, CAMERA.expand(2, 3, 3), torch.stack([T, T @ below]), index
     )
-    assert bool(differ[0, 1])
+    assert differ[0, 1]
     assert float(scores[0, 1]) < -0.5
 
 
@@ -201,7 +202,7 @@ def test_pairs_of_many_photographs_are_compared_as_each_alone():
     first = torch.tensor([0, 3, 4])
     second = torch.tensor([2, 1, 0])
     found, looks_different = details.compare_pairs(table, first, second)
-    assert bool(differ[first, second].all())
+    assert differ[first, second].all()
     assert torch.equal(looks_different, differ[first, second])
     torch.testing.assert_close(found, scores[first, second])
     # by hand, of the first pair

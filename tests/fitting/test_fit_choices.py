@@ -14,6 +14,7 @@ from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.rendering.contours import MeshContours
+from tests._support.numbers import double
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, silhouette
 
 Weigh = Callable[[ContourProblem, ContourState, Tensor], Tensor]
@@ -22,7 +23,7 @@ Weigh = Callable[[ContourProblem, ContourState, Tensor], Tensor]
 def starts(*degrees):
     """Poses of the cube, turned about the y axis."""
     twist = torch.zeros(len(degrees), 6, dtype=torch.float64)
-    twist[:, 1] = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    twist[:, 1] = torch.deg2rad(double(degrees))
     return apply_twist(CUBE_POSE.repeat(len(degrees), 1, 1), twist, mesh_centre(cube()))
 
 
@@ -124,12 +125,12 @@ class Half:
 )
 def test_the_next_best_fit_is_another_pose(x, support, expected):
     T = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
-    T[:, 0, 3] = torch.tensor(x, dtype=torch.float64)
+    T[:, 0, 3] = double(x)
     points = torch.zeros(4, 1)
     fits = ContourState(T, T, points)
     half = Half()
     index = torch.zeros(1, dtype=torch.long)
-    supports = torch.tensor([support], dtype=torch.float64)
+    supports = double([support])
     source, chosen = contour_fit._two_best(half, fits, supports, index)
     assert chosen[:, 0, 3].tolist() == pytest.approx(expected)
     assert source.tolist() == [0] * len(expected)

@@ -14,6 +14,7 @@ from curvireg_torch.fitting.measured_fit import FULL_SIZE_RADII
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.geometry.cameras import projected
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from tests._support.numbers import double
 from tests._support.scenes import SIZE, scene, truck_registrar
 
 NEAR = camera_matrix(150.0, 150.0, 119.5, 89.5)  # a wide angle, from where perspective is strong
@@ -44,7 +45,7 @@ def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
     T = scene(0)[2][None].clone()
     centre = truck_registrar().describer.centre
     T[0, 0, 3] += 0.3  # off the axis
-    zoom = torch.tensor([0.01], dtype=torch.float64)
+    zoom = double([0.01])
     moved = focal_length.moved_away(T, zoom, centre)
     longer = focal_length.scaled_cameras(NEAR[None], zoom)
     assert longer[0].tolist() == [
@@ -57,7 +58,7 @@ def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
     )
     torch.testing.assert_close(before, after)
     turn = focal_length._motion_with_focal_length(T, centre)[0, :3] * 0.01
-    assert float(rotation_error(moved[0, :3, :3], T[0, :3, :3])) == pytest.approx(
+    assert rotation_error(moved[0, :3, :3], T[0, :3, :3]) == pytest.approx(
         float(torch.rad2deg(turn.norm())), rel=0.02
     )
 
@@ -69,7 +70,7 @@ def test_derivative_by_the_focal_length():
         T[None], torch.tensor([[0.05, 0.1, 0.0, 0.02, 0.0, 0.0]]).double(), problem.centre
     )
     state = problem.state(T)
-    step = torch.tensor([1e-5], dtype=torch.float64)
+    step = double([1e-5])
 
     def pixels(sign):
         moved = focal_length.moved_away(T, sign * step, problem.centre)
@@ -81,7 +82,7 @@ def test_derivative_by_the_focal_length():
     valid = state.points.valid
     found = focal_length._by_focal_length(problem, state, uv, J)
     torch.testing.assert_close(found[valid], numeric[valid], atol=1e-4, rtol=1e-4)
-    assert float(found[valid].abs().max()) > 1.0
+    assert found[valid].abs().max() > 1.0
 
 
 @pytest.mark.parametrize("wrong", [0.75, 1.35])
@@ -94,7 +95,7 @@ def test_strong_perspective_shows_the_focal_length(wrong):
         problem, start, focal_length.FocalPrior.usual(guess[None], SIZE), FULL_SIZE_RADII
     )
     assert wrong * float(fit.log_zoom.exp()) == pytest.approx(1.0, abs=0.06)
-    assert float(rotation_error(fit.state.T[0, :3, :3], T[:3, :3])) < 1.5
+    assert rotation_error(fit.state.T[0, :3, :3], T[:3, :3]) < 1.5
     information, _ = focal_length.focal_information(fit.problem, fit.state, 2.0)
     assert float(information.variance.sqrt()) < 0.2
 
@@ -124,7 +125,7 @@ def test_the_pull_of_a_prior_does_not_grow_beyond_its_reach():
     """A prior far away pulls as far as one at its reach."""
     image, box, T = near_scene()
     problem = fitting_problem(image, box, NEAR)
-    gap = torch.tensor([2.0], dtype=torch.float64)
+    gap = double([2.0])
     wide = gap + 5.0
 
     def zoom(**changes):
@@ -145,7 +146,7 @@ def test_a_focal_length_moves_by_steps():
     """Of a quarter of log f, whatever pulls: six in three rounds."""
     image, box, T = near_scene()
     problem = fitting_problem(image, box, NEAR)
-    gap = torch.tensor([5.0], dtype=torch.float64)
+    gap = double([5.0])
     prior = focal_length.FocalPrior(gap, 1e-3, -2.0 * gap, 2.0 * gap)
     fit = focal_length.fit_focal_length(problem, T[None], prior, FULL_SIZE_RADII)
     assert 1.0 < float(fit.log_zoom) <= 1.5 + 1e-9

@@ -14,6 +14,7 @@ from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.rendering.contours import ContourPoints
+from tests._support.numbers import double
 from tests.fitting.cube import K, fitted, pose, silhouette
 
 ZERO = torch.zeros(3, dtype=torch.float64)
@@ -23,7 +24,7 @@ def test_project_and_its_derivative():
     points = torch.rand(1, 7, 3, dtype=torch.float64)
     normals = torch.rand(1, 7, 2, dtype=torch.float64)
     T = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None]
-    centre = torch.tensor([0.4, 0.5, 0.6], dtype=torch.float64)
+    centre = double([0.4, 0.5, 0.6])
 
     def moved(step):
         uv, _ = ls.project(points, normals, ls.apply_twist(T, step[None], centre), K[None], centre)
@@ -51,8 +52,8 @@ def test_long_steps_are_shortened(rotation, translation, fraction):
     """Translations are given as fractions of the distance of the centre, which lies half a unit
     behind the origin."""
     T = pose([0.0, 0.0, 0.0], [0.0, 0.0, 6.0])[None]
-    centre = torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64)
-    step = torch.tensor([[*rotation, *(6.5 * t for t in translation)]], dtype=torch.float64)
+    centre = double([0.0, 0.0, 0.5])
+    step = double([[*rotation, *(6.5 * t for t in translation)]])
     A = torch.eye(6, dtype=torch.float64)[None]
     torch.testing.assert_close(
         ls.least_squares_step(A, step[..., None], T, centre, 0.0), fraction * step
@@ -60,7 +61,7 @@ def test_long_steps_are_shortened(rotation, translation, fraction):
 
 
 def test_damping_shortens_each_direction_alike():
-    A = torch.diag(torch.tensor([1.0, 100.0, 1e4, 1.0, 1.0, 1.0], dtype=torch.float64))[None]
+    A = torch.diag(double([1.0, 100.0, 1e4, 1.0, 1.0, 1.0]))[None]
     x = ls.damped_solution(A, A @ torch.ones(1, 6, 1, dtype=torch.float64), 0.25)
     torch.testing.assert_close(x, torch.full((1, 6), 0.8, dtype=torch.float64))
     assert ls.damped_solution(0 * A, torch.zeros(1, 6, 1).double(), 0.01).tolist() == [[0.0] * 6]
@@ -124,7 +125,7 @@ def cloud(count):
     the normals."""
     generator = torch.Generator().manual_seed(0)
     T = pose([0.3, -0.5, 0.2], [-1.6, -0.4, 6.0])[None]
-    centre = torch.tensor([2.0, 0.5, 0.6], dtype=torch.float64)
+    centre = double([2.0, 0.5, 0.6])
     model = centre + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
     normals = F.normalize(
         torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1
@@ -180,7 +181,7 @@ def test_covariance_needs_a_minimum_of_weight(factor, known):
 def test_covariance_of_a_cylinder_has_unknown_rotation_about_its_axis(axis_angle):
     mesh = trimesh.creation.cylinder(0.5, 1.4, sections=96)
     T = pose(axis_angle, [0.1, 0.0, 8.0])
-    off = torch.tensor([[0.0, 0.0, 0.0, 0.1, 0.1, 0.2]], dtype=torch.float64)
+    off = double([[0.0, 0.0, 0.0, 0.1, 0.1, 0.2]])
     fit = fitted(silhouette(mesh, T), ls.apply_twist(T[None], off, mesh_centre(mesh)), mesh=mesh)
     assert 4 <= int(fit.observable) <= 5
     C = fit.covariance[0, :3, :3]
@@ -204,7 +205,7 @@ def test_covariance_follows_the_unit_of_the_mesh(unit, across):
     C, known = ls.pose_covariance(ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
     scaled = T.clone()
     scaled[:, :3, 3] *= unit
-    S = torch.tensor([1.0, 1.0, 1.0, unit, unit, unit], dtype=torch.float64)
+    S = double([1.0, 1.0, 1.0, unit, unit, unit])
     larger = replace(points, model=unit * points.model)
     measured = ls.Measurements(J / S, d, W)
     found, directions = ls.pose_covariance(
@@ -219,7 +220,7 @@ def test_covariance_follows_the_unit_of_the_mesh(unit, across):
 def test_long_steps_are_shortened_by_the_distance_in_any_unit(unit):
     T = pose([0.0, 0.0, 0.0], [0.0, 0.0, 3.0 * unit])[None]
     centre = unit * torch.tensor([0.0, 0.0, 0.5]).double()
-    step = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 3.5 * unit]], dtype=torch.float64)
+    step = double([[0.0, 0.0, 0.0, 0.0, 0.0, 3.5 * unit]])
     assert ls.step_fraction(step, T, centre).tolist() == [pytest.approx(ls.MAX_TRANSLATION)]
 
 

@@ -5,6 +5,7 @@ import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import Camera, camera_matrix, project_points, undistorted
+from tests._support.numbers import double
 
 SIZE = (120, 160)
 MATRIX = camera_matrix(110.0, 112.0, 77.0, 61.0)
@@ -62,9 +63,9 @@ def test_pixels_beyond_the_valid_radius_repeat_its_border():
     beyond = torch.hypot(u - 79.5, v - 59.5) > 0.8165 * 60
     assert torch.equal(seen.missing, beyond)
     largest = 0.8165 * (1 - 0.5 * 0.8165**2) * 60 / 100
-    assert float((seen.image[0][beyond] - largest).abs().max()) < 0.01
+    assert (seen.image[0][beyond] - largest).abs().max() < 0.01
     folded = cv2.undistort(radius.numpy(), camera.matrix.numpy(), np.array(camera.distortion))
-    assert float(folded[beyond.numpy()].min()) < 0.05  # the centre again
+    assert folded[beyond.numpy()].min() < 0.05  # the centre again
 
 
 def test_unusable_cameras_and_boxes_outside_of_what_is_shown_are_refused():
@@ -87,7 +88,7 @@ def test_unusable_cameras_and_boxes_outside_of_what_is_shown_are_refused():
 
 def test_camera_of_a_resized_photograph():
     small = RADIAL.at((60, 80))
-    points = torch.tensor([[0.3, -0.2, 1.0], [-0.5, 0.4, 2.0]], dtype=torch.float64)
+    points = double([[0.3, -0.2, 1.0], [-0.5, 0.4, 2.0]])
     large = project_points(points, torch.eye(4).double(), MATRIX)
     pose = torch.eye(4).double()
     # The corner of the picture, (-0.5, -0.5) in px, is the same point in both.
@@ -110,7 +111,7 @@ def test_sides_are_scaled_on_their_own_when_a_resized_picture_is_rounded():
     x = 9 / 640
     y = 7 / 480
     expected = [[500 * x, 0, 320 * x - 0.5], [0, 500 * y, 240 * y - 0.5], [0, 0, 1]]
-    torch.testing.assert_close(small.matrix, torch.tensor(expected, dtype=torch.float64))
+    torch.testing.assert_close(small.matrix, double(expected))
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from curvireg_torch.geometry.cameras import point_in_cameras, pose_around
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
+from tests._support.numbers import double
 
 K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
 
@@ -44,13 +45,13 @@ def test_pose_from_box_recovers_the_true_pose(spread):
         R = g.rotation_towards(ray) @ view
         box = g.projected_boxes(hull, g.transform(R, ray - R @ centre), K)
         found_R, found_t = g.pose_from_box(hull, view, box, K)
-        assert float(g.rotation_error(found_R, R)) < 0.01
-        assert float((found_R @ centre + found_t - ray).norm() / ray.norm()) < 1e-4
+        assert g.rotation_error(found_R, R) < 0.01
+        assert ((found_R @ centre + found_t - ray).norm() / ray.norm()) < 1e-4
 
 
 def test_pose_from_box_keeps_the_object_in_front_of_the_camera():
-    cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
-    box = torch.tensor([-1e5, -1e5, 1e5, 1e5], dtype=torch.float64) + K[:2, 2].repeat(2)
+    cube = torch.cartesian_prod(*[double([-1.0, 1.0])] * 3)
+    box = double([-1e5, -1e5, 1e5, 1e5]) + K[:2, 2].repeat(2)
     nearest = 1.05 * 3.0**0.5  # extents of the cube
     straight = g.pose_from_box(cube, torch.eye(3, dtype=torch.float64), box, K)[1]
     assert float(straight[2]) == pytest.approx(nearest, rel=1e-6)

@@ -7,12 +7,13 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
+from tests._support.numbers import double
 
 
 def test_opengl_cameras_look_backward_with_y_up():
     R = torch.from_numpy(Rotation.random(7, random_state=0).as_matrix())
-    T = g.transform(R, torch.tensor([0.2, -0.1, 5.0], dtype=torch.float64).expand(7, 3))
-    flipped = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)) @ T
+    T = g.transform(R, double([0.2, -0.1, 5.0]).expand(7, 3))
+    flipped = torch.diag(double([1.0, -1.0, -1.0, 1.0])) @ T
     assert torch.equal(g.opengl_from_opencv(T), flipped)
     assert torch.equal(g.opencv_from_opengl(flipped), T)
 
@@ -31,8 +32,8 @@ def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d():
         xy = p[:, :2] / p[:, 2:]
         xy = xy @ np.array([[math.cos(tr), math.sin(tr)], [-math.sin(tr), math.cos(tr)]])
         expected = np.stack([px + xy[:, 0], py - xy[:, 1]], 1)
-        R = g.rotation_from_viewpoint(*(torch.tensor(v, dtype=torch.float64) for v in (a, e, t)))
-        T = g.transform(R, torch.tensor([0.0, 0.0, d], dtype=torch.float64))
+        R = g.rotation_from_viewpoint(*(double(v) for v in (a, e, t)))
+        T = g.transform(R, double([0.0, 0.0, d]))
         ours = g.project_points(
             torch.from_numpy(X), T, g.camera_matrix(f, f, px, py, dtype=torch.float64)
         )
@@ -50,7 +51,7 @@ def test_axis_angle_agrees_with_scipy(angle):
     np.testing.assert_allclose(ours, R, atol=1e-14)
     back = g.axis_angle_from_rotation(torch.from_numpy(R))
     np.testing.assert_allclose(g.rotation_from_axis_angle(back), R, atol=1e-14)
-    assert float(back.norm(dim=1).max()) <= math.pi + 1e-12
+    assert back.norm(dim=1).max() <= math.pi + 1e-12
 
 
 AXIS = [1.0, 2.0, -2.0]

@@ -7,6 +7,7 @@ from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry.crops import check_boxes, crop_squares, image_transforms
 from curvireg_torch.utils.checks import check_camera_matrix
+from tests._support.numbers import double
 
 
 def ramp(height, width):
@@ -17,7 +18,7 @@ def ramp(height, width):
 
 def test_image_transforms_invert_crop_transforms_with_exact_zeros():
     # A camera matrix with 1e-16 in place of 0, which some versions of LAPACK leave, is refused.
-    squares = torch.tensor([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]], dtype=torch.float64)
+    squares = double([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]])
     back = image_transforms(squares, 32)
     torch.testing.assert_close(
         back @ g.crop_transforms(squares, 32), torch.eye(3).double().expand(2, 3, 3)
@@ -43,7 +44,7 @@ def test_crop_images_agrees_with_its_transforms_on_a_ramp(side, size, off):
 def test_crop_squares_are_triangle_filtered(side):
     image = torch.rand(2, 70, 90, dtype=torch.float64)
     size = 11
-    corners = torch.tensor([[40.3, 31.2], [30.1, -1.7], [88.0, 60.0]], dtype=torch.float64)
+    corners = double([[40.3, 31.2], [30.1, -1.7], [88.0, 60.0]])
     squares = torch.cat([corners, corners + torch.tensor([[side], [1.1 * side], [side]])], dim=1)
     crops = crop_squares(image, squares, size)
 
@@ -83,8 +84,8 @@ def test_crop_images_spreads_missing_pixels_no_further_than_its_filter():
     at = A[0] @ torch.tensor([45.0, 35.0, 1.0])
     rows, columns = lost[0, 1].nonzero().unbind(1)
     assert 1 <= int(lost.sum()) == int(lost[0, 1].sum()) <= 9
-    assert float((columns - at[0]).abs().max()) < 2.0
-    assert float((rows - at[1]).abs().max()) < 2.0
+    assert (columns - at[0]).abs().max() < 2.0
+    assert (rows - at[1]).abs().max() < 2.0
     torch.testing.assert_close(crop[~lost], clean[~lost], rtol=0, atol=0)
     crops, _ = g.crop_images(torch.cat([inside, image]), boxes.expand(2, 4), size=32)
     torch.testing.assert_close(crops[1], clean[0])

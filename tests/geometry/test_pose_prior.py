@@ -49,7 +49,7 @@ def test_azimuth_excess_and_nearest_are_the_least_rotation_into_the_range(elevat
     assert float(prior.excess(R)) == pytest.approx(float(least), abs=0.3)
     moved = prior.nearest(R)
     assert float(prior.excess(moved)) <= 1e-4
-    assert float(rotation_error(moved, R)) == pytest.approx(float(prior.excess(R)), abs=1e-4)
+    assert rotation_error(moved, R) == pytest.approx(float(prior.excess(R)), abs=1e-4)
 
 
 def test_elevation_and_theta_are_limited_each_by_itself():
@@ -75,7 +75,7 @@ def test_nearest_moves_rotations_to_the_border_and_keeps_those_inside(prior):
     R = random_rotations(4000)
     before = prior.excess(R)
     moved = prior.nearest(R)
-    assert float(prior.excess(moved).max()) < 1e-5
+    assert prior.excess(moved).max() < 1e-5
     inside = before <= 0.0
     assert inside.any()
     assert not inside.all()
@@ -91,8 +91,8 @@ def test_nearest_satisfies_limits_together():
         azimuth=(30, 60), elevation=(0, 25), theta=(-8, 8), rotation=centre, within=25.0
     )
     R = random_rotations(500)
-    assert float(prior.excess(prior._moved_once(R, None)).max()) > 1.0
-    assert float(prior.excess(prior.nearest(R)).max()) < 0.1
+    assert prior.excess(prior._moved_once(R, None)).max() > 1.0
+    assert prior.excess(prior.nearest(R)).max() < 0.1
 
 
 @pytest.mark.parametrize(

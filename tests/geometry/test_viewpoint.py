@@ -17,6 +17,7 @@ from curvireg_torch.geometry import (
 )
 from curvireg_torch.geometry.viewpoint import angles_between
 from curvireg_torch.utils.choices import UP_AXES
+from tests._support.numbers import double
 
 
 @pytest.mark.parametrize(
@@ -24,9 +25,9 @@ from curvireg_torch.utils.choices import UP_AXES
     [
         ((30, 20.0, 0), torch.float64),
         ((torch.tensor(30.0), 20.0, 0), torch.float32),
-        ((torch.tensor(30.0, dtype=torch.float64), 20.0, 0), torch.float64),
+        ((double(30.0), 20.0, 0), torch.float64),
         ((torch.tensor(30), 20.0, 0), torch.float32),
-        ((torch.tensor(30.0), torch.tensor(20.0, dtype=torch.float64), 0), torch.float64),
+        ((torch.tensor(30.0), double(20.0), 0), torch.float64),
         ((30, torch.tensor(20.0, dtype=torch.float16), 0.5), torch.float16),
     ],
 )
@@ -40,11 +41,11 @@ def test_rotations_have_the_type_of_the_tensors_and_of_numbers_alone_float64(ang
 def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint():
     R = torch.from_numpy(Rotation.random(500, random_state=0).as_matrix())
     a, e, t = g.viewpoint_from_rotation(R)
-    assert bool(((a >= 0) & (a < 360) & (e.abs() <= 90) & (t >= -180) & (t < 180)).all())
+    assert ((a >= 0) & (a < 360) & (e.abs() <= 90) & (t >= -180) & (t < 180)).all()
     torch.testing.assert_close(g.rotation_from_viewpoint(a, e, t), R, rtol=0, atol=1e-12)
     R = g.rotation_from_viewpoint(torch.tensor([-1e-9, 720.0]), 0.0, torch.tensor([180.0, -180.0]))
     a, _, t = g.viewpoint_from_rotation(R)
-    assert bool(((a < 360) & (t < 180)).all()), "angles are wrapped"
+    assert ((a < 360) & (t < 180)).all(), "angles are wrapped"
     torch.testing.assert_close(t.abs(), torch.full_like(t, 180.0), rtol=0, atol=1e-4)
 
 
@@ -119,7 +120,7 @@ def test_paper_views_is_the_grid_of_the_paper():
     assert len(one_shell) == 126
     R = one_shell.rotations.double()
     # no view twice
-    assert float((rotation_error(R[:, None], R) + 9.0 * torch.eye(126)).min()) > 3.0
+    assert (rotation_error(R[:, None], R) + 9.0 * torch.eye(126)).min() > 3.0
     # Neighbours in elevation differ by 50 degrees about the camera's x axis.
     grid = one_shell.rotations.view(7, 18, 3, 3)
     assert torch.allclose(rotation_error(grid[1:], grid[:-1]), torch.tensor(50.0), atol=1e-3)

@@ -13,6 +13,7 @@ from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, sa
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.terms import Appearance, Correlation, Repeatability
+from tests._support.numbers import double
 from tests._support.scenes import scene
 
 
@@ -40,10 +41,10 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
     ranking = matcher(*batch(0, 1))
     assert ranking.scores.shape == ranking.order.shape == (2, len(bank))
     sorted_scores = ranking.scores.gather(1, ranking.order)
-    assert bool((sorted_scores[:, :-1] >= sorted_scores[:, 1:]).all())
+    assert (sorted_scores[:, :-1] >= sorted_scores[:, 1:]).all()
     for scores in (ranking.scores, ranking.hog, ranking.repeatability, ranking.terms["box"]):
-        assert float(scores.min()) >= 0
-        assert float(scores.max()) <= 1 + 1e-6
+        assert scores.min() >= 0
+        assert scores.max() <= 1 + 1e-6
     box = ranking.terms["box"].log()
     parts = (
         Correlation().log_score(ranking.hog),
@@ -123,8 +124,8 @@ def test_matcher_weights_terms(bank):
 
 
 def test_distinct_views_applies_symmetries_to_the_model():
-    R = rotation_from_axis_angle(torch.tensor([0.9, -0.4, 0.7], dtype=torch.float64))
-    quarter = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2], dtype=torch.float64))
+    R = rotation_from_axis_angle(double([0.9, -0.4, 0.7]))
+    quarter = rotation_from_axis_angle(double([0.0, 0.0, math.pi / 2]))
     symmetries = torch.stack(
         [torch.eye(3, dtype=torch.float64), quarter, quarter @ quarter, quarter.T]
     )
@@ -185,7 +186,7 @@ def test_appearance_is_compared_with_the_views_that_were_compared(small_bank):
         rankings = [SimpleNamespace(terms={Appearance.name: one[None]}) for one in (raw, second)]
         scores = matcher.appearance_scores(SimpleNamespace(), rankings, features, photograph)
         for score, (compared, mine) in zip(scores.tolist(), poses, strict=True):
-            values = torch.cat([compared.double(), torch.tensor([mine], dtype=torch.float64)])
+            values = torch.cat([compared.double(), double([mine])])
             expected = (mine - float(compared.max())) / float(values.std(correction=0))
             assert score == pytest.approx(expected, rel=1e-5)
 

@@ -1,6 +1,5 @@
 """Left-over parts far away, rounded coordinates, and colours that do not vary."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +18,6 @@ from curvireg_torch.mesh.colours import SurfaceColours
 from curvireg_torch.mesh.health import stray_faces
 from curvireg_torch.mesh.mesh import as_mesh
 
-Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 SIDES = (60.0, 40.0, 30.0)
 
 
@@ -56,7 +54,7 @@ def test_left_over_parts_do_not_set_the_box(scale, at):
     assert len(mesh.faces) == 12
     np.testing.assert_allclose(mesh.extents, np.array(SIDES) * scale)
     assert mesh_radius(mesh) == pytest.approx(0.5 * float(np.linalg.norm(SIDES)) * scale)
-    assert float(mesh_centre(mesh).abs().max()) < 1e-9 * scale
+    assert mesh_centre(mesh).abs().max() < 1e-9 * scale
     (warning,) = mesh_warnings(mesh)
     assert warning.kind == "stray"
     assert "of 14 faces 2 near" in warning.text
@@ -210,12 +208,11 @@ def test_the_pose_of_a_mesh_far_from_its_origin():
         result = cr.Registrar(bank, pipeline=bank.pipeline)(
             [scene.image], [scene.box], scene.camera_matrix
         )[0]
-        assert result.translation is not None
         poses.append(
             (result.rotation, result.translation.numpy() + result.rotation.numpy() @ offset)
         )
     (first, near), (second, far) = poses
-    assert float(cr.rotation_error(first, second)) < 1e-3
+    assert cr.rotation_error(first, second) < 1e-3
     np.testing.assert_allclose(far, near, atol=1e-6)
 
 

@@ -15,6 +15,7 @@ from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import confidence
 from curvireg_torch.synthetic import procedural_background
+from tests._support.numbers import double
 from tests._support.quick import slow_after
 from tests._support.scenes import (
     CAMERA,
@@ -125,7 +126,7 @@ def test_confidence_features():
         details=torch.tensor([0.5, 0.0, 0.0]).double(),
         contours=torch.tensor([0.9, 0.8, 1.0]).double(),
     )
-    scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
+    scores = double([5.5, 2.0, 3.0])
     doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0, "focal": 0.3}
     given = {**doubts, "printed": 3.5}
     expected = {
@@ -151,7 +152,7 @@ def test_confidence_features():
 
 
 def test_undetermined_axes():
-    variances = torch.tensor([0.04, 0.25, 9.0, 1.0, 1.0, 1.0], dtype=torch.float64)
+    variances = double([0.04, 0.25, 9.0, 1.0, 1.0, 1.0])
     covariance = torch.diag(variances)
     assert confidence.undetermined_axes(covariance) == pytest.approx(0.2 + 0.5 + 1.0)
     assert confidence.undetermined_axes(torch.full_like(covariance, torch.nan)) == 3.0
@@ -269,7 +270,7 @@ def test_evidence_is_measured_at_the_reported_pose(camera):
     describer, (image, box, _) = registrar.describer, scene(0)
     query = describer.descriptor(registrar.matcher.query([image], box[None]).field)
     for h in registrar([image], box[None], camera)[0].hypotheses:
-        distance = torch.tensor([h.distance], dtype=torch.float64)
+        distance = double([h.distance])
         view = describer.descriptors(h.allocentric_rotation[None], distance)
         assert h.score == pytest.approx(
             float(torch.nn.functional.cosine_similarity(view, query)), abs=1e-5

@@ -12,17 +12,18 @@ from curvireg_torch.geometry.cameras import rotation_towards
 from curvireg_torch.registration.camera import principal_covariance
 from curvireg_torch.registration.hypotheses import Hypotheses, placed
 from curvireg_torch.visualization.words import remarks
+from tests._support.numbers import double
 from tests._support.results import registration
 from tests._support.scenes import CAMERA
 
 COVARIANCE = torch.diag(torch.tensor([0.02, 0.05, 0.03, 1.0, 2.0, 8.0]).double().square())
-CENTRE = torch.tensor([20.0, -30.0, 10.0], dtype=torch.float64)
+CENTRE = double([20.0, -30.0, 10.0])
 
 
 def pose():
     """Rotation, translation, allocentric rotation and distance, in mm."""
     R = rotation_from_viewpoint(30.0, 20.0, 5.0).double()
-    t = torch.tensor([80.0, -40.0, 600.0], dtype=torch.float64)
+    t = double([80.0, -40.0, 600.0])
     position = R @ CENTRE + t
     return R, t, rotation_towards(position[None])[0].T @ R, float(position.norm())
 
@@ -37,14 +38,14 @@ def test_nine_in_ten_errors_are_within(monkeypatch):
     turns = rotation_from_axis_angle(errors[:, :3])
     centres = turns @ R @ CENTRE + t + errors[:, 3:]
     within = torch.rad2deg(errors[:, :3].norm(dim=1)) < exactness.rotation_deg
-    assert float(within.double().mean()) == pytest.approx(0.9, abs=0.02)
+    assert within.double().mean() == pytest.approx(0.9, abs=0.02)
     away = 100.0 * (centres.norm(dim=1) / distance - 1.0).abs()
     within = away < exactness.distance_percent
-    assert float(within.double().mean()) == pytest.approx(0.9, abs=0.02)
+    assert within.double().mean() == pytest.approx(0.9, abs=0.02)
     seen = rotation_towards(centres).mT @ turns @ R
     cosine = ((seen * allocentric).sum(dim=(1, 2)) - 1.0) / 2.0
     within = torch.rad2deg(cosine.clamp(-1.0, 1.0).acos()) < exactness.allocentric_deg
-    assert float(within.double().mean()) == pytest.approx(0.9, abs=0.02)
+    assert within.double().mean() == pytest.approx(0.9, abs=0.02)
 
 
 def test_a_principal_point_that_is_not_known_leaves_the_allocentric_rotation_exact():

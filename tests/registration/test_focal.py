@@ -15,6 +15,7 @@ from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.hypotheses import Hypotheses, projected_box
 from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
+from tests._support.numbers import double
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 from tests.fitting.test_focal_length import NEAR, near_scene
 
@@ -45,9 +46,9 @@ def test_an_unknown_camera_is_estimated():
     assert torch.equal(result.camera.matrix, result.projection[1])
     ratio = float(result.camera.matrix[0, 0] / NEAR[0, 0])
     assert abs(ratio - 1.0) < max(0.1, 3.0 * result.camera.focal_deviation)
-    assert float(rotation_error(result.rotation, T[:3, :3])) < 5.0
+    assert rotation_error(result.rotation, T[:3, :3]) < 5.0
     position = result.transform[:3, 3] / ratio - T[:3, 3]
-    assert float(position.norm()) < 0.1 * float(T[:3, 3].norm()), (
+    assert position.norm() < 0.1 * float(T[:3, 3].norm()), (
         "the distance is proportional to the focal length"
     )
     given = learned_registrar()([image], box[None], NEAR)[0]
@@ -69,11 +70,11 @@ def test_focal_lengths_with_small_deviations_are_right():
         widths = (0.7, 1.0, 1.4)[seed % 3]
         K = camera_matrix(640 * widths, 640 * widths, 319.5, 239.5, dtype=torch.float64)
         T = random_pose(mesh, K, size, generator, elevations=(5.0, 50.0))
-        near = torch.tensor([0.0, 0.0, 2.5 * describer.radius], dtype=torch.float64)
+        near = double([0.0, 0.0, 2.5 * describer.radius])
         T[:3, 3] = near - T[:3, :3] @ describer.centre
         image, box = synthesize_photograph(mesh, T, K, size, generator)
         result = learned_registrar()([image], box[None])[0]
-        assert float(rotation_error(result.rotation, T[:3, :3])) < 3.0
+        assert rotation_error(result.rotation, T[:3, :3]) < 3.0
         error = abs(float((result.camera.matrix[0, 0] / K[0, 0]).log()))
         ratios.append(error / result.camera.focal_deviation)
         if result.camera.focal_deviation < 0.05:
@@ -104,7 +105,7 @@ def test_zoomed_poses_keep_their_images():
     assert float(moved.distance[0]) > 1.9 * float(poses.distance[0])
     before = projected_box(describer, (T, NEAR))
     after = projected_box(describer, (moved.T[0], moved.cameras[0]))
-    assert float((before - after).abs().max()) < 0.2 * float((before[2:] - before[:2]).max())
+    assert (before - after).abs().max() < 0.2 * float((before[2:] - before[:2]).max())
     centre = [
         (K @ (P[:3, :3] @ describer.centre + P[:3, 3]))
         for P, K in ((T, NEAR), (moved.T[0], moved.cameras[0]))
@@ -159,7 +160,7 @@ def test_the_deviation_joins_prior_and_photograph():
 
 def test_an_unknown_principal_point_moves_the_object_with_its_ray_and_keeps_its_look():
     size = (180, 240)
-    centre = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64)
+    centre = double([0.3, -0.2, 0.4])
     T = scene(0)[2][None].double()
     none = torch.zeros(1)
     pose = Hypotheses.at(T, CAMERA[None], centre, none.long(), none.double())

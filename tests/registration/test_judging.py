@@ -12,11 +12,10 @@ from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import judged
+from tests._support.numbers import double
 from tests._support.scenes import CAMERA, SIZE
 
-HULL = 0.3 * torch.tensor(
-    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=torch.float64
-)
+HULL = 0.3 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 BOX = torch.tensor([90.0, 60.0, 150.0, 120.0])
 HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
 
@@ -37,7 +36,7 @@ def poses_at(*degrees, x=0.0):
 def evidence_of(**columns):
     H = len(next(iter(columns.values())))
     values = {field.name: torch.zeros(H, dtype=torch.float64) for field in fields(Evidence)}
-    given = {name: torch.tensor(column, dtype=torch.float64) for name, column in columns.items()}
+    given = {name: double(column) for name, column in columns.items()}
     return Evidence(**{**values, **given})
 
 
@@ -175,7 +174,7 @@ def test_siblings_are_rivals_though_the_shape_looks_the_same(siblings):
 
 def test_doubts_are_those_of_the_best_pose():
     poses = poses_at(0.0, 90.0)
-    known = torch.diag(torch.tensor([0.01, 0.04, 0.09, 1.0, 1.0, 1.0], dtype=torch.float64))
+    known = torch.diag(double([0.01, 0.04, 0.09, 1.0, 1.0, 1.0]))
     poses.covariance[1] = known
     evidence = evidence_of(similarity=[0.5, 0.6])
     box = torch.tensor([-0.5, 60.0, 150.0, 120.0])

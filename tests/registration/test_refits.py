@@ -88,7 +88,7 @@ def test_the_best_pose_and_its_close_rivals_are_fitted_again(monkeypatch):
     assert refit.fitted == [[1], [0, 2]]
     assert refit.compared == [(1, [0, 2])]
     assert not any(moved)
-    assert bool((evidence.details == 1.0).all()), "of the comparison"
+    assert (evidence.details == 1.0).all(), "of the comparison"
 
 
 def test_results_with_a_higher_score_are_kept_and_no_others(monkeypatch):

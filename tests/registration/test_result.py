@@ -11,12 +11,13 @@ from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration.result import Axis, ambiguity, likely_rivals
+from tests._support.numbers import double
 from tests._support.results import registration
 
 
 def test_to_dict_replaces_unbounded_deviations_by_null():
     """Unbounded from one radian, and from half the distance."""
-    variances = torch.tensor([0.25, 0.81, 1.21, 0.81, 0.9801, 1.0201], dtype=torch.float64)
+    variances = double([0.25, 0.81, 1.21, 0.81, 0.9801, 1.0201])
     document = registration(torch.diag(variances)).to_dict()
     degrees = 180.0 / torch.pi
     deviations = document["standard_deviations"]
@@ -139,7 +140,7 @@ def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_dete
         assert not replace(sure, **change).reliable
     assert replace(sure, prior_contradiction="at the limit").reliable
     # Not where all three rotations are unknown, as those of a sphere.
-    variances = torch.tensor([9.0, 9.0, 9.0, 1e-4, 1e-4, 1e-4], dtype=torch.float64)
+    variances = double([9.0, 9.0, 9.0, 1e-4, 1e-4, 1e-4])
     sphere = registration(covariance=torch.diag(variances), confidence=0.95)
     fitted = replace(
         sphere, hypotheses=tuple(replace(h, edge_support=0.5) for h in sphere.hypotheses)

@@ -171,7 +171,7 @@ def test_a_view_is_refined_among_its_neighbours():
     wanted = rotation_from_viewpoint(25.0, 45.0)
     view = int(rotation_error(matcher.bank.rotations, wanted).argmin())
     refined = search.refine(matcher, None, view)
-    assert float(rotation_error(refined, wanted.double())) < 1e-3
+    assert rotation_error(refined, wanted.double()) < 1e-3
     assert len(matcher.compared[-1]) == 9
 
 
@@ -185,7 +185,7 @@ def test_different_views_differ_in_rotation_however_little():
 
 def test_search_is_between_allowed_views():
     _, _, matcher = searched(207.0, 0.0, 3.7, allowed=(240.0, 300.0))
-    assert float(matcher.compared[0].azimuth.min()) >= 240.0 - 1e-3
+    assert matcher.compared[0].azimuth.min() >= 240.0 - 1e-3
 
 
 def test_search_is_in_the_frame_of_the_views():
@@ -286,7 +286,7 @@ def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh
     # the allocentric one is what is searched for: the other follows from the centre of a box, which
     # does not turn with the mesh
     found = second.allocentric_rotation @ turn
-    assert float(rotation_error(found, first.allocentric_rotation)) < 0.1
+    assert rotation_error(found, first.allocentric_rotation) < 0.1
 
 
 def test_the_search_comes_nearer_than_its_views():

@@ -13,6 +13,7 @@ from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import rig as rig_module
 from curvireg_torch.registration.rig import Rig
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
+from tests._support.numbers import double
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, learned_registrar
 
@@ -33,7 +34,7 @@ def photograph(azimuth, seed, noise):
     generator = torch.Generator().manual_seed(seed)
     mesh = example_mesh()
     R = rotation_from_viewpoint(azimuth, 8.0, 0.0).double()
-    ahead = torch.tensor([0.0, 0.0, 6.0 * mesh_radius(mesh)], dtype=torch.float64)
+    ahead = double([0.0, 0.0, 6.0 * mesh_radius(mesh)])
     T = transform(R, ahead - R @ mesh_centre(mesh))
     image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, generator, texture=0.6)
     return (image + noise * torch.randn(image.shape, generator=generator)).clamp(0, 1), box, T
@@ -51,9 +52,9 @@ def registered(images, boxes, cameras):
 
 def check_pose(result, *, degrees=2.0, shift=0.1):
     """``T_world_from_model`` is right, ``shift`` in radii."""
-    assert float(rotation_error(result.rotation, WORLD[:3, :3])) < degrees
+    assert rotation_error(result.rotation, WORLD[:3, :3]) < degrees
     off = result.translation - WORLD[:3, 3]
-    assert float(off.norm()) < shift * mesh_radius(example_mesh())
+    assert off.norm() < shift * mesh_radius(example_mesh())
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +153,7 @@ def test_boxes_may_be_missing():
     )
     check_pose(result, degrees=1.0, shift=0.05)
     assert result.views[1].failure is None
-    assert float((result.views[1].box - boxes[1]).abs().max()) < 8
+    assert (result.views[1].box - boxes[1]).abs().max() < 8
     assert "lies outside" in result.views[3].failure
 
 
@@ -192,7 +193,7 @@ def test_covariance_grows_where_photographs_contradict_each_other(easy):
     """A camera that is turned by a degree moves its picture by 5 px of 100."""
     images, boxes, cameras = rig_of(EASY)
     turn = torch.eye(4, dtype=torch.float64)
-    turn[:3, :3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0175, 0.0], dtype=torch.float64))
+    turn[:3, :3] = rotation_from_axis_angle(double([0.0, 0.0175, 0.0]))
     result = registered(images, boxes, torch.stack([cameras[0], turn @ cameras[1], cameras[2]]))
     spread = [float(r.hypotheses[0].covariance[3:, 3:].trace()) for r in (easy, result)]
     assert spread[1] > 2 * spread[0]
@@ -200,8 +201,8 @@ def test_covariance_grows_where_photographs_contradict_each_other(easy):
 
 def test_a_motion_of_the_world_moves_the_answer(easy):
     images, boxes, cameras = rig_of(EASY)
-    turn = rotation_from_axis_angle(torch.tensor([0.4, 2.0, -0.7], dtype=torch.float64))
-    motion = transform(turn, torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64))
+    turn = rotation_from_axis_angle(double([0.4, 2.0, -0.7]))
+    motion = transform(turn, double([3.0, -1.0, 0.5]))
     moved = registered(images, boxes, cameras @ torch.linalg.inv(motion))
     torch.testing.assert_close(moved.transform, motion @ easy.transform, atol=1e-5, rtol=0)
     assert moved.confidence == pytest.approx(easy.confidence, abs=1e-3)

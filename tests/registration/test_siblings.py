@@ -18,6 +18,7 @@ from curvireg_torch.registration import judging
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import Siblings
 from curvireg_torch.registration.target import TellingSymmetries
+from tests._support.numbers import double
 from tests._support.scenes import CAMERA
 
 
@@ -30,14 +31,14 @@ def four(similarity, compare, angles):
     rank = torch.zeros(len(T), dtype=torch.float64)
     poses = Hypotheses.at(T, CAMERA.expand(len(T), 3, 3), torch.zeros(3).double(), index, rank)
     different = ~torch.eye(len(T), dtype=torch.bool)
-    details = torch.tensor(compare, dtype=torch.float64)
+    details = double(compare)
     poses = replace(poses, evidence=evidence(*similarity))
     return Siblings(poses, details, different, EvidenceWeights())
 
 
 def evidence(*similarity):
     nothing = Evidence.zeros(len(similarity))
-    return replace(nothing, similarity=torch.tensor(similarity, dtype=torch.float64))
+    return replace(nothing, similarity=double(similarity))
 
 
 def test_a_sibling_is_better_by_its_score_and_by_details():
@@ -130,8 +131,8 @@ class Case:
         given = evidence(0.99, 0.9, 0.5)
         before = replace(self.poses, evidence=given, is_outside=outside)
         after, rival, _ = judging.with_siblings(target, block, crops, before)
-        assert not bool(rival.is_outside.any())
-        assert bool(rival.is_sibling.all())
+        assert not rival.is_outside.any()
+        assert rival.is_sibling.all()
         return after, after.evidence, rival
 
 

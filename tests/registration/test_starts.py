@@ -5,14 +5,15 @@ import torch
 
 from curvireg_torch.registration.photograph import MIN_BOX_SIDE
 from curvireg_torch.registration.refinement import INVERSE, OPENGL, why_outside
+from tests._support.numbers import double
 
 SIZE = (180, 240)
-K = torch.tensor([[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]], dtype=torch.float64)
+K = double([[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]])
 
 
 def pose(*translation):
     T = torch.eye(4, dtype=torch.float64)
-    T[:3, 3] = torch.tensor(translation, dtype=torch.float64)
+    T[:3, 3] = double(translation)
     return T
 
 
@@ -23,7 +24,7 @@ def test_the_likely_mistake_is_named(scale):
         * 0.05
         * (torch.rand(20, 3, generator=torch.manual_seed(0), dtype=torch.float64) - 0.5)
     )
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    flip = torch.diag(double([1.0, -1.0, -1.0, 1.0]))
     right = pose(0.02 * scale, 0.01 * scale, 0.4 * scale)
     for factor, words in (
         (0.001, "1000 times too small, as metres"),
@@ -44,10 +45,10 @@ def test_the_likely_mistake_is_named(scale):
 @pytest.mark.parametrize("is_opengl", [False, True])
 def test_the_pose_of_the_camera_in_the_object_is_named(is_opengl):
     hull = 0.05 * (torch.rand(20, 3, generator=torch.manual_seed(0), dtype=torch.float64) - 0.5)
-    quarter = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=torch.float64)
+    quarter = double([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     right = pose(0.02, 0.01, 0.4)
     right[:3, :3] = quarter
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    flip = torch.diag(double([1.0, -1.0, -1.0, 1.0]))
     wrong = torch.linalg.inv(flip @ right if is_opengl else right)
     message = str(why_outside(hull, wrong, K, SIZE))
     assert message.startswith(INVERSE)

@@ -14,9 +14,10 @@ from curvireg_torch.fitting.regions import RegionModel, Silhouette
 from curvireg_torch.geometry.framing import boxes_at
 from curvireg_torch.registration import tracking
 from curvireg_torch.registration.tracking import Tracker
+from tests._support.numbers import double
 from tests.fitting.cube import pose
 
-K = torch.tensor([[200.0, 0, 99.5], [0, 200.0, 49.5], [0, 0, 1]], dtype=torch.float64)
+K = double([[200.0, 0, 99.5], [0, 200.0, 49.5], [0, 0, 1]])
 SIZE = (100, 200)
 
 
@@ -24,9 +25,7 @@ def at(x=0.0, z=5.0):
     return pose([0.0, 0.0, 0.0], [x, 0.0, z])[None]
 
 
-HULL = 0.5 * torch.tensor(
-    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=torch.float64
-)
+HULL = 0.5 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 
 def test_boxes_of_meshes_outside_the_image_mean_nothing():
@@ -299,7 +298,7 @@ def test_colours_are_learned_on_both_sides_of_the_outline():
     count = len(band)
     assert len(x) == 3 * 2 * count
     assert int(inside.sum()) == 3 * count
-    assert bool((inside == (x > 128)).all())
+    assert (inside == (x > 128)).all()
     assert float((x - 128.0).abs().min()) == min(band)
     assert float((x - 128.0).abs().max()) == max(band)
 

@@ -22,10 +22,11 @@ from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.block import Block
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.photograph import Photograph
+from tests._support.numbers import double
 from tests._support.scenes import CAMERA, SIZE
 
 NOTHING = None
-CENTRE = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64)
+CENTRE = double([0.3, -0.2, 0.4])
 BOX = torch.tensor([60.0, 40.0, 180.0, 140.0])
 
 
@@ -33,14 +34,14 @@ def poses_at(count, *, K=CAMERA, rank=None):
     """Of the views 0, 1, ..., turned about the vertical axis."""
     R = torch.stack([rotation_from_viewpoint(70.0 * k, 30.0, 0.0).double() for k in range(count)])
     T = transform(R, torch.tensor([0.1, 0.0, 5.0]).double().expand(count, 3))
-    ranks = torch.tensor(rank or [0.0] * count, dtype=torch.float64)
+    ranks = double(rank or [0.0] * count)
     return Hypotheses.at(T, K.expand(count, 3, 3), CENTRE, torch.arange(count), ranks)
 
 
 def evidence_of(*similarity):
     nothing = torch.zeros(len(similarity), dtype=torch.float64)
     values = Evidence(*[nothing] * len(fields(Evidence)))
-    return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64))
+    return replace(values, similarity=double(similarity))
 
 
 def test_cameras_that_are_tried_have_all_fields_of_view():
@@ -86,7 +87,7 @@ def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source
 
     def fit(problem, T, *_):
         fitted.append(problem.factor)
-        zoom = torch.tensor([0.1], dtype=torch.float64)
+        zoom = double([0.1])
         return SimpleNamespace(problem=problem, state=SimpleNamespace(T=T), log_zoom=zoom)
 
     def measured(_, __, support, ___):
@@ -108,7 +109,7 @@ def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source
 def test_the_covariance_is_that_of_the_origin(monkeypatch):
     """With the motion of the centre and the rotation about it, of an origin beside the centre."""
     pose = replace(poses_at(1), covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
-    motion = torch.tensor([[0.02, -0.03, 0.01, 0.3, -0.1, 0.5]], dtype=torch.float64)
+    motion = double([[0.02, -0.03, 0.01, 0.3, -0.1, 0.5]])
     none = torch.ones(1, dtype=torch.float64)
     information = FocalInformation(amount=none, scale=0.04 * none, step=none)
     problem = SimpleNamespace(state=lambda _: None)
@@ -219,7 +220,7 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
     (photograph,) = block.photographs
     assert photograph.focal_deviation == 0.07
     assert torch.equal(photograph.camera_matrix, poses.cameras[1])
-    assert bool(after.covariance[[0, 2]].isnan().all())
+    assert after.covariance[[0, 2]].isnan().all()
     assert torch.equal(after.covariance[1], best[0])
 
 

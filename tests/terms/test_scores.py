@@ -99,7 +99,7 @@ def test_dilate_points_uses_a_euclidean_disc(eps):
     points = torch.rand(3, 31, 40, generator=torch.Generator().manual_seed(0)) < 0.02
     points[0] = False
     dilated = terms.dilate_points(points, eps)
-    assert not bool(dilated[0].any())
+    assert not dilated[0].any()
     assert terms.dilate_points(points[:, :, :0], eps).shape == (3, 31, 0)
     for plane, expected in zip(dilated[1:], points[1:], strict=True):
         assert (plane.numpy() == (distance_transform_edt(~expected.numpy()) <= eps)).all()

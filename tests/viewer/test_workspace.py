@@ -315,8 +315,8 @@ def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
     vertices = torch.tensor(workspace.session.mesh.vertices) @ T[:3, :3].mT + T[:3, 3]
     seen = (vertices @ K.mT)[:, :2] / vertices[:, 2:]
     distances = torch.cdist(torch.tensor([*sides, *foot, *handle]).double(), seen).amin(dim=1)
-    assert float(distances.mean()) < 4
-    assert float(distances[-len(handle) :].max()) < 8, "the handle is at the handle"
+    assert distances.mean() < 4
+    assert distances[-len(handle) :].max() < 8, "the handle is at the handle"
 
 
 def test_warnings_and_defects_become_messages(workspace, capsys):

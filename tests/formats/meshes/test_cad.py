@@ -5,7 +5,6 @@ import math
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -21,7 +20,6 @@ from curvireg_torch.utils import extras
 from curvireg_torch.utils.extras import is_installed
 from tests.formats.meshes.step import iges_file, step_file
 
-Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 BOX = trimesh.creation.box((30.0, 20.0, 10.0))
 
 
@@ -193,7 +191,6 @@ def test_collada_files_keep_their_unit_and_axes(tmp_path, load, asset, unit, up,
     assert (mesh.units, mesh_up(mesh), texts) == (unit, up, [])
     np.testing.assert_allclose(mesh.bounds, np.array([[10, 0, 0], [14, 2, 0]]) * scale, atol=1e-6)
     colours = surface_colours(mesh)
-    assert colours is not None
     np.testing.assert_array_equal(colours.textures[0], pixels)
     np.testing.assert_allclose(colours.uv[0], [[0, 0], [1, 0], [0, 1]], atol=1e-6)
     assert tmp_path / "label.png" in mesh_files(tmp_path / "a.dae")
@@ -335,7 +332,6 @@ def test_threemf_reads_colours_and_textures(tmp_path, load):
     resources = f"{base}</basematerials>" + solid(1, 'pid="5" pindex="1"', 'pid="5" p1="0"')
     mesh, _ = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))
     colours = surface_colours(mesh)
-    assert colours is not None
     assert (colours.corners[:6] == [255, 0, 0]).all()
     assert (colours.corners[6:] == [0, 0, 255]).all()
     group = (
@@ -349,12 +345,10 @@ def test_threemf_reads_colours_and_textures(tmp_path, load):
         )
     )
     colours = surface_colours(mesh)
-    assert colours is not None
     assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
     # a corner without an entry has that of the first
     few = group + solid(1, "", 'pid="6" p1="0" p2="1"')
     colours = surface_colours(load(threemf(tmp_path / "a.3mf", few, '<item objectid="1"/>'))[0])
-    assert colours is not None
     assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
     pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "a.png")
@@ -373,7 +367,6 @@ def test_threemf_reads_colours_and_textures(tmp_path, load):
         threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>', more=pictures)
     )
     colours = surface_colours(mesh)
-    assert colours is not None
     assert not texts
     np.testing.assert_array_equal(colours.textures[0], pixels)
     assert colours.uv[0].tolist() == [[0, 0], [1, 0], [0, 1]]
@@ -472,7 +465,6 @@ def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path, load):
     names = {path.name for path in mesh_files(tmp_path / "arm.urdf")}
     assert names == {"arm.urdf", "base.stl", "tip.ply"}
     colours = surface_colours(mesh)
-    assert colours is not None
     assert (colours.corners[:12] == [0, 0, 255]).all()
     with pytest.raises(MeshError, match=r"no link 'hand'; it has base, tip, ball"):
         cr.load_mesh(tmp_path / "arm.urdf", link="hand")

@@ -278,7 +278,6 @@ def test_a_texture_of_many_groups_is_unpacked_once(tmp_path, monkeypatch):
 
     monkeypatch.setattr(threemf._Package, "_content", noted)
     found = files.read_source(MeshSource(path)).colours
-    assert found is not None
     assert len(found.textures) == 1
     assert asked.count("/3D/a.png") == 1
     monkeypatch.setitem(threemf._MOST, "triangle", 9)
@@ -298,7 +297,7 @@ def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(tmp_path, mon
     decode = Mock(wraps=colours._texture)
     monkeypatch.setattr(source, "texture_pixels", Mock(wraps=source.texture_pixels))
     files.read_source(MeshSource(path))
-    assert source.texture_pixels.call_count == 1  # type: ignore[attr-defined]
+    assert source.texture_pixels.call_count == 1
     assert decode.call_count == 0
     copies = '<instance_geometry url="#g"/>' * 4
     skin = '<controller id="c"><skin source="#g"/></controller>'
@@ -319,14 +318,14 @@ def test_a_program_has_limits_of_time_and_memory(tmp_path):
     program = tmp_path / "program.py"
     limits = {"name": "It", "seconds": 60.0, "memory": 1 << 28, "advice": "export less"}
     program.write_text("import sys\nsys.exit(int(sys.argv[1]))")
-    assert run_program(program, ["0"], **limits)  # type: ignore[arg-type]
-    assert not run_program(program, ["1"], **limits)  # type: ignore[arg-type]
+    assert run_program(program, ["0"], **limits)
+    assert not run_program(program, ["1"], **limits)
     program.write_text("x = bytearray(1 << 29)")
     with pytest.raises(ValueError, match=r"It needs more than 268,435,456 bytes .*; export less"):
-        run_program(program, [], **limits)  # type: ignore[arg-type]
+        run_program(program, [], **limits)
     program.write_text("while True:\n    pass")
     with pytest.raises(ValueError, match=r"It took more than 0.5 seconds; export less"):
-        run_program(program, [], **{**limits, "seconds": 0.5})  # type: ignore[arg-type]
+        run_program(program, [], **{**limits, "seconds": 0.5})
 
 
 @pytest.mark.skipif(not is_installed("cascadio"), reason="cascadio is not installed")

@@ -2,7 +2,6 @@
 
 import argparse
 import warnings
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ HALVES = [
     "f 3 7 8\nf 3 8 4\nf 1 5 7\nf 1 7 3\nf 2 4 8\nf 2 8 6\n",
 ]
 BOX = POINTS + "".join(HALVES)
-Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 
 
 def textured(faces):
@@ -104,7 +102,6 @@ def test_materials_of_all_libraries_and_none_without_a_name(tmp_path, load):
         (tmp_path / "a.obj").write_text(head + body)
         mesh, texts = load(tmp_path / "a.obj")
         colours = surface_colours(mesh)
-        assert colours is not None
         assert not texts
         assert (colours.corners[:6] == [255, 0, 0]).all()
         assert (colours.corners[6:] == [0, 0, 255]).all()
@@ -115,7 +112,6 @@ def test_materials_of_all_libraries_and_none_without_a_name(tmp_path, load):
         f"mtllib a.mtl\n{POINTS}usemtl red\n{HALVES[0]}usemtl\n{HALVES[1]}"
     )
     colours = surface_colours(load(tmp_path / "a.obj")[0])
-    assert colours is not None
     assert (colours.corners[6:] == 255).all(), "no name: no material"
 
 
@@ -148,7 +144,6 @@ def test_options_of_a_texture_precede_its_name(
     path = write(tmp_path, f"newmtl label\nKd 1 1 1\nmap_Kd {options} {name}\n")
     mesh, texts = load(path)
     colours = surface_colours(mesh)
-    assert colours is not None
     assert not texts
     np.testing.assert_array_equal(colours.textures[0], pixels)
     expected = np.array([[0, 0], [1, 0], [0, 1]]) * scale + offset
@@ -200,7 +195,6 @@ def test_colours_behind_the_coordinates(tmp_path, load):
         )
         (tmp_path / "a.obj").write_text(points + "".join(HALVES))
         colours = surface_colours(load(tmp_path / "a.obj")[0])
-        assert colours is not None
         assert set(map(tuple, colours.corners.reshape(-1, 3).tolist())) == {
             (0, 0, 255),
             (255, 0, 255),

@@ -5,7 +5,6 @@ import itertools
 import math
 import warnings
 import zipfile
-from collections.abc import Callable
 from io import BytesIO
 
 import numpy as np
@@ -25,7 +24,6 @@ from tests.formats.meshes.test_gltf import Tree
 from tests.formats.meshes.test_ply import header, rows
 from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, painted, square, stage
 
-Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 needs_usd = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
 TRIANGLE = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]
 RED = [255, 0, 0]
@@ -39,14 +37,12 @@ QUARTER = [0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 def first_corners(mesh):
     """The colours of the first corner of each face."""
     colours = surface_colours(mesh)
-    assert colours is not None
     return colours.corners[:, 0].tolist()
 
 
 def textures(mesh):
     """The colour of each face's texture in its first texel; white where there is none."""
     colours = surface_colours(mesh)
-    assert colours is not None
     plain = [texture[0, 0].tolist() for texture in colours.textures]
     return [plain[k] if k >= 0 else WHITE for k in colours.texture]
 
@@ -123,7 +119,6 @@ def textured(more, material=None):
 
 def coordinates(mesh):
     colours = surface_colours(mesh)
-    assert colours is not None
     return colours.uv[0] * [1, -1] + [0, 1]  # from the top left, as in glTF
 
 
@@ -153,7 +148,7 @@ def test_specular_colours_win_over_metallic_ones(tmp_path):
     material = {"pbrMetallicRoughness": metallic, "extensions": specular}
     mesh = cr.load_mesh(textured({}, material).write(tmp_path / "a.gltf"))
     assert (first_corners(mesh), textures(mesh)) == ([BLUE], [WHITE])
-    assert surface_colours(mesh).textures == ()  # type: ignore[union-attr]
+    assert surface_colours(mesh).textures == ()
 
 
 def test_a_picture_as_webp_wins(tmp_path):
@@ -227,7 +222,6 @@ def test_coordinates_are_scaled_and_moved_along_each_axis(tmp_path, options, fir
     library = f"newmtl m\nmap_Kd {options} a.png\n"
     path = obj(tmp_path, {"a.mtl": library}, "vt 0 0\nvt 1 2\nf 1/1 2/2 3/2\n")
     colours = surface_colours(cr.load_mesh(path))
-    assert colours is not None
     assert colours.uv[1, :2].tolist() == [first, last]
 
 
@@ -419,12 +413,10 @@ def test_a_mirrored_part_keeps_its_outside_and_its_colours():
     colours = surface_colours(
         trimesh.Trimesh(TRIANGLE, [[0, 1, 2]], vertex_colors=[RED, GREEN, BLUE])
     )
-    assert colours is not None
     colours.uv[0] = [[0, 0], [1, 0], [0, 1]]
     mesh = ReadMesh(np.array(TRIANGLE), np.array([[0, 1, 2]]), colours, "mm", "y")
     for signs, corners in (((-1, 1, 1), [BLUE, GREEN, RED]), ((-1, -1, 1), [RED, GREEN, BLUE])):
         moved = mesh.transformed(np.diag([*signs, 1.0]))
-        assert moved.colours is not None
         assert moved.colours.corners[0].tolist() == corners
         order = [corners.index(colour) for colour in (RED, GREEN, BLUE)]
         assert moved.colours.uv[0, order].tolist() == [[0, 0], [1, 0], [0, 1]]

@@ -1,10 +1,7 @@
 """PLY files as scanners write them."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 
 import curvireg_torch as cr
@@ -12,7 +9,6 @@ from curvireg_torch.errors import MeshError
 from curvireg_torch.mesh import has_colours, surface_colours
 from tests._support.doubling import check_linear
 
-Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 POINTS = [(0, 0, 0), (4, 0, 0), (4, 2, 0), (0, 2, 0)]
 SHADES = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (51, 102, 153)]
 
@@ -40,7 +36,6 @@ def test_colours_under_every_name(tmp_path, load, prefix, short, kind):
     (tmp_path / "a.ply").write_text(header(vertex, "") + rows(extra) + "3 0 1 2\n3 0 2 3\n")
     mesh, texts = load(tmp_path / "a.ply")
     colours = surface_colours(mesh)
-    assert colours is not None
     assert not texts
     np.testing.assert_array_equal(colours.corners, np.array(SHADES)[mesh.faces])
 
@@ -51,7 +46,6 @@ def test_colours_of_16_bits_are_scaled(tmp_path, load):
     (tmp_path / "a.ply").write_text(header(vertex, "") + rows(extra) + "3 0 1 2\n3 0 2 3\n")
     mesh, _ = load(tmp_path / "a.ply")
     colours = surface_colours(mesh)
-    assert colours is not None
     np.testing.assert_array_equal(colours.corners, np.array(SHADES)[mesh.faces])
 
 
@@ -75,7 +69,6 @@ def test_two_textures_are_read_or_named(tmp_path, load):
     (tmp_path / "a.ply").write_text(text)
     mesh, texts = load(tmp_path / "a.ply")
     colours = surface_colours(mesh)
-    assert colours is not None
     assert not texts
     for k, number in enumerate(colours.texture):
         np.testing.assert_array_equal(colours.textures[number], pixels[1 - k])
@@ -98,7 +91,6 @@ def test_texture_coordinates_of_vertices(tmp_path, load, names):
     (tmp_path / "a.ply").write_text(text + rows(["0 0", "1 0", "1 1", "0 1"]) + "4 0 1 2 3\n")
     mesh, texts = load(tmp_path / "a.ply")
     colours = surface_colours(mesh)
-    assert colours is not None
     assert not texts
     np.testing.assert_array_equal(colours.textures[0], pixels)
     np.testing.assert_allclose(

@@ -1,7 +1,6 @@
 """STL files as people have them."""
 
 import struct
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
 from tests._support.doubling import check_linear
 
-Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 BOX = trimesh.creation.box((3.0, 2.0, 1.0))
 
 

@@ -1,12 +1,10 @@
 """USD files, which are generated: their places, units, axes, colours and textures."""
 
 import zipfile
-from collections.abc import Callable
 from io import BytesIO
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 
 import curvireg_torch as cr
@@ -18,7 +16,6 @@ from curvireg_torch.mesh.colours import colours_at
 from curvireg_torch.utils import extras
 from curvireg_torch.utils.extras import is_installed
 
-Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 pytestmark = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
 
 SQUARE = """
@@ -84,7 +81,7 @@ def package(path, text, **more):
     with zipfile.ZipFile(path, "w") as file:
         for name, content in {"part.usda": text.encode(), **more}.items():
             entry = zipfile.ZipInfo(name.replace("__", "/").replace("_png", ".png"))
-            end = file.fp.tell() + 30 + len(entry.filename.encode())  # type: ignore[union-attr]
+            end = file.fp.tell() + 30 + len(entry.filename.encode())
             padding = -(end + 4) % 64
             entry.extra = b"\x86\x19" + padding.to_bytes(2, "little") + bytes(padding)
             file.writestr(entry, content)
@@ -132,7 +129,6 @@ def test_colours_of_the_mesh(tmp_path, load):
     path.write_text(stage(square(more, counts="3, 3", indices="0, 1, 2, 0, 2, 3")))
     mesh, _ = load(path)
     found = surface_colours(mesh)
-    assert found is not None
     assert found.corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
     assert has_colours(mesh)
 
@@ -170,7 +166,6 @@ def painted(colour):
 
 def textures_of(mesh):
     colours = surface_colours(mesh)
-    assert colours is not None
     return [texture[0, 0].tolist() for texture in colours.textures]
 
 
@@ -224,7 +219,6 @@ def test_textures_are_scaled(tmp_path, load):
         mesh, texts = load(path)
         assert len(texts) == count
         colours = surface_colours(mesh)
-        assert colours is not None
         assert colours.corners[0, 0].tolist() == tint
 
 
