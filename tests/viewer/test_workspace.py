@@ -12,6 +12,7 @@ import struct
 import threading
 import warnings
 import zipfile
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -46,8 +47,45 @@ async def upload(workspace, path, name=None, content=None, is_first=True):
     await workspace.receive(name or path.name, len(content), blocks(), is_first=is_first)
 
 
+@contextmanager
+def shown_warnings():
+    """Warnings become messages of the page, as in its process."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = show_warning
+        yield
+
+
+def send(*given, **how):
+    with shown_warnings():
+        asyncio.run(upload(*given, **how))
+
+
 def names(workspace):
     return [shot.path.name for shot in workspace.session.shots]
+
+
+def picture():
+    file = io.BytesIO()
+    Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3)).save(file, "PNG")
+    return file.getvalue()
+
+
+TEXTURED = b"""mtllib a.mtl
+v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+vt 0 0
+vt 1 0
+vt 0 1
+usemtl m
+f 1/1 2/2 3/3
+f 1/1 2/2 4/3
+f 1/1 3/2 4/3
+f 2/1 3/2 4/3
+"""
+"""A tetrahedron with a material of the library a.mtl."""
 
 
 def stored(workspace):
@@ -57,10 +95,10 @@ def stored(workspace):
 def test_uploads_find_their_place(workspace, scene):
     session = workspace.session
     for name in ("truck.ply", "part.PLY"):
-        asyncio.run(upload(workspace, scene / "truck.ply", name))
+        send(workspace, scene / "truck.ply", name)
         assert "968 faces" in workspace.session.mesh_facts
     for name in ("a.png", "b.png"):
-        asyncio.run(upload(workspace, scene / "photo.png", name))
+        send(workspace, scene / "photo.png", name)
     assert (names(workspace), session.shot.path.name) == (["a.png", "b.png"], "b.png")
     assert (session.shot.photo.image.shape, workspace.messages) == ((3, 180, 240), {})
     assert sorted(stored(workspace)) == ["a.png", "b.png", "part.PLY"], "the former mesh is removed"
@@ -71,7 +109,7 @@ def test_uploads_find_their_place(workspace, scene):
         "camera_matrix": [300.0, 0, 119.5, 0, 300, 89.5, 0, 0, 1],
         "dist": [0.1, 0, 0, 0, 0],
     }
-    asyncio.run(upload(workspace, scene, "cam.json", json.dumps(calibration).encode()))
+    send(workspace, scene, "cam.json", json.dumps(calibration).encode())
     assert session.shot.photo.notes == ("undistorted",)
     asyncio.run(workspace.remove_photo())
     assert (names(workspace), session.shot.photo) == ([], None)
@@ -89,28 +127,30 @@ def test_messages_are_about_one_file_and_go_with_the_next_files(workspace, scene
         "lost.mtl": ("file", b"x", "no open mesh names it; drop it with its mesh"),
         "cam.yaml": ("camera", b"x: 1", "no camera matrix"),
     }
-    asyncio.run(upload(workspace, scene / "photo.png", "good.png"))
+    send(workspace, scene / "photo.png", "good.png")
     for name, (_, content, _) in wrong.items():
-        asyncio.run(upload(workspace, scene, name, content, is_first=name == "half.png"))
-    asyncio.run(upload(workspace, scene / "photo.png", is_first=False))
+        send(workspace, scene, name, content, is_first=name == "half.png")
+    send(workspace, scene / "photo.png", is_first=False)
     for name, (part, _, words) in wrong.items():
         (line,) = [v for v in workspace.messages[part].splitlines() if v.startswith(f"{name}: ")]
         assert re.match(f"{name}: {words}", line)
         assert str(workspace.folder) not in line
     assert names(workspace) == ["good.png", "photo.png"]
     assert sorted(stored(workspace)) == ["good.png", "photo.png"]
-    asyncio.run(upload(workspace, scene / "truck.ply"))
+    send(workspace, scene / "truck.ply")
     assert workspace.messages == {}
 
 
-def test_a_refused_mesh_leaves_the_warning_about_the_open_one(workspace, tmp_path):
+def test_a_mesh_of_a_doubtful_size_asks_for_its_unit_until_another_is_open(workspace, tmp_path):
+    """Whatever the words of the warning are; a mesh that is refused leaves it."""
+    trimesh.creation.box((0.3, 0.2, 0.1)).export(tmp_path / "small.stl")
     trimesh.creation.box((300.0, 200.0, 100.0)).export(tmp_path / "large.stl")
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        warnings.showwarning = show_warning
-        asyncio.run(upload(workspace, tmp_path / "large.stl"))
-        warning = workspace.messages["mesh"]
-        asyncio.run(upload(workspace, tmp_path, "bad.ply", b"ply\nnonsense"))
+    for name, asks in (("large.stl", True), ("small.stl", False)):
+        send(workspace, tmp_path / name)
+        assert workspace.asks_for_unit == asks
+    send(workspace, tmp_path / "large.stl")
+    warning = workspace.messages["mesh"]
+    send(workspace, tmp_path, "bad.ply", b"ply\nnonsense")
     first, second = workspace.messages["mesh"].splitlines()
     assert (first, second.split(": ")[0]) == (warning, "bad.ply")
     assert workspace.asks_for_unit
@@ -121,7 +161,7 @@ def test_a_refused_mesh_leaves_the_warning_about_the_open_one(workspace, tmp_pat
 def test_a_removed_photograph_can_be_brought_back(workspace, scene, monkeypatch):
     session = workspace.session
     for name in ("a.png", "b.png"):
-        asyncio.run(upload(workspace, scene / "photo.png", name))
+        send(workspace, scene / "photo.png", name)
     session.shot = session.shots[0]
     session.shot.set_box((1.0, 2.0, 30.0, 40.0))
     asyncio.run(workspace.remove_photo())
@@ -134,40 +174,34 @@ def test_a_removed_photograph_can_be_brought_back(workspace, scene, monkeypatch)
     asyncio.run(workspace.remove_photo())
     size = (scene / "photo.png").stat().st_size
     monkeypatch.setattr(module, "MAX_VIEWER_BYTES", 2 * size)
-    asyncio.run(upload(workspace, scene / "photo.png", "c.png"))
+    send(workspace, scene / "photo.png", "c.png")
     assert (names(workspace), session.removed) == (["b.png", "c.png"], None), "for want of room"
 
 
+async def started(workspace):
+    await workspace.start_search()
+
+
 def test_the_error_of_a_search_goes_when_its_inputs_change(workspace, scene, monkeypatch):
-    asyncio.run(upload(workspace, scene / "photo.png"))
+    send(workspace, scene / "photo.png")
     monkeypatch.setattr(
         workspace.session, "register", Mock(side_effect=InvalidInputError("box: too small"))
     )
 
-    async def search():
-        await workspace.start_search()
-
-    asyncio.run(search())
+    asyncio.run(started(workspace))
     assert workspace.pose_message() == "box: too small"
     workspace.session.shot.set_box((1.0, 2.0, 90.0, 80.0))
     assert (workspace.pose_message(), workspace.messages) == ("", {})
 
 
 def test_what_a_mesh_names_is_part_of_it_and_no_photograph(workspace, scene):
-    picture = io.BytesIO()
-    Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3)).save(picture, "PNG")
-    mesh = b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\n"
-    mesh += b"f 1/1 2/2 3/3\nf 1/1 2/2 4/3\nf 1/1 3/2 4/3\nf 2/1 3/2 4/3\n"
-    files = {"a.obj": mesh, "a.mtl": b"newmtl m\nmap_Kd maps/wood.png\n"}
-    files["wood.png"] = picture.getvalue()
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        warnings.showwarning = show_warning
-        for name, content in files.items():
-            asyncio.run(upload(workspace, scene, name, content, is_first=name == "a.obj"))
+    material = b"newmtl m\nmap_Kd maps/wood.png\n"
+    files = {"a.obj": TEXTURED, "a.mtl": material, "wood.png": picture()}
+    for name, content in files.items():
+        send(workspace, scene, name, content, is_first=name == "a.obj")
     assert (names(workspace), workspace.messages) == ([], {})
     assert workspace.session.mesh_facts.endswith("rendered in its colours")
-    asyncio.run(upload(workspace, scene / "photo.png", "plywood.png"))
+    send(workspace, scene / "photo.png", "plywood.png")
     assert names(workspace) == ["plywood.png"], "only a whole name counts"
 
 
@@ -176,10 +210,10 @@ def test_a_gltf_waits_for_its_buffer(workspace, tmp_path):
     parts = trimesh.exchange.gltf.export_gltf(scene, merge_buffers=True)
     (buffer,) = set(parts) - {"model.gltf"}
     model = parts["model.gltf"].replace(buffer.encode(), b"my%20data.bin")
-    asyncio.run(upload(workspace, tmp_path, "box.gltf", model))
+    send(workspace, tmp_path, "box.gltf", model)
     assert "names 'my data.bin', which is no file" in workspace.messages["mesh"]
     assert workspace.session.mesh is None
-    asyncio.run(upload(workspace, tmp_path, "my data.bin", parts[buffer], is_first=False))
+    send(workspace, tmp_path, "my data.bin", parts[buffer], is_first=False)
     assert (workspace.messages, workspace.session.mesh_path.name) == ({}, "box.gltf")
     assert sorted(stored(workspace)) == ["box.gltf", "my data.bin"]
 
@@ -200,7 +234,7 @@ def test_a_part_is_put_where_its_mesh_names_it_but_never_outside_its_folder(tmp_
 
 def test_a_calibration_of_another_size_is_refused_beside_the_camera(workspace, scene, monkeypatch):
     """The page, which looks several times a second, never sees a camera that does not fit."""
-    asyncio.run(upload(workspace, scene / "photo.png"))
+    send(workspace, scene / "photo.png")
     session = workspace.session
     session.set_camera((300.0, 300.0, 119.5, 89.5))
     seen = []
@@ -212,7 +246,7 @@ def test_a_calibration_of_another_size_is_refused_beside_the_camera(workspace, s
         "camera_matrix": [300.0, 0, 319.5, 0, 300, 89.5, 0, 0, 1],
         "image_size": [640, 180],
     }
-    asyncio.run(upload(workspace, scene, "cam.json", json.dumps(calibration).encode()))
+    send(workspace, scene, "cam.json", json.dumps(calibration).encode())
     assert workspace.messages["camera"].startswith("photo.png: camera: calibrated for 640 x 180")
     assert session.request().camera == (300.0, 300.0, 119.5, 89.5)
     assert seen == [(300.0, 300.0, 119.5, 89.5)]
@@ -228,42 +262,28 @@ def test_uploads_are_bounded_and_not_larger_than_announced(workspace, scene, mon
     assert stored(workspace) == []
     size = (scene / "photo.png").stat().st_size
     monkeypatch.setattr(module, "MAX_VIEWER_BYTES", 2 * size)
-    asyncio.run(upload(workspace, scene / "photo.png"))
-    asyncio.run(upload(workspace, scene / "photo.png"))
+    send(workspace, scene / "photo.png")
+    send(workspace, scene / "photo.png")
     with pytest.raises(InvalidInputError, match=r"^x\.png: all files have more than"):
-        asyncio.run(upload(workspace, scene, "x.png", b"0"))
+        send(workspace, scene, "x.png", b"0")
 
 
 def test_a_mesh_without_its_texture_is_not_called_coloured(workspace, tmp_path):
-    mesh = b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\n"
-    mesh += b"f 1/1 2/2 3/3\nf 1/1 2/2 4/3\nf 1/1 3/2 4/3\nf 2/1 3/2 4/3\n"
     material = b"newmtl m\nKd 0.8 0.1 0.1\nmap_Kd a.png\n"
     facts = (
         "rendered in grey: materials or textures are missing; send it with them in a zip archive"
     )
-    pack(tmp_path / "a.zip", {"a.obj": mesh, "a.mtl": material})
-    for path, content in (("a.obj", mesh), ("a.zip", None)):
-        with warnings.catch_warnings():
-            warnings.simplefilter("always")
-            warnings.showwarning = show_warning
-            asyncio.run(upload(workspace, tmp_path / path, content=content))
+    parts = {"a.obj": TEXTURED, "a.mtl": material}
+    pack(tmp_path / "a.zip", parts)
+    for path, content in (("a.obj", TEXTURED), ("a.zip", None)):
+        send(workspace, tmp_path / path, content=content)
         assert workspace.session.mesh_facts.endswith(facts)
         assert "missing" in workspace.messages["mesh"]
         assert str(tmp_path) not in workspace.messages["mesh"]
-    picture = io.BytesIO()
-    Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3)).save(picture, "PNG")
-    pack(tmp_path / "a.zip", {"a.obj": mesh, "a.mtl": material, "a.png": picture.getvalue()})
-    asyncio.run(upload(workspace, tmp_path / "a.zip"))
+    send(workspace, pack(tmp_path / "a.zip", {**parts, "a.png": picture()}))
     assert workspace.session.mesh_facts.endswith("rendered in its colours")
     assert workspace.messages == {}
-    pack(
-        tmp_path / "a.zip",
-        {"a.obj": mesh, "a.mtl": material, "a.png": b"%!PS-Adobe-3.0 EPSF-3.0\n"},
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        warnings.showwarning = show_warning
-        asyncio.run(upload(workspace, tmp_path / "a.zip"))
+    send(workspace, pack(tmp_path / "a.zip", {**parts, "a.png": b"%!PS-Adobe-3.0 EPSF-3.0\n"}))
     assert workspace.session.mesh_facts.endswith(facts)
 
 
@@ -289,13 +309,13 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
     assert "CC0" in session.shot.photo.notes[0]
     assert workspace.session.mesh_facts.endswith("mm, rendered in its colours")
     assert workspace.messages == {}
-    asyncio.run(upload(workspace, scene, "notes.pdf", b"x"))
+    send(workspace, scene, "notes.pdf", b"x")
     assert session.options.pose == "upright", "it replaces nothing"
-    asyncio.run(upload(workspace, scene / "photo.png"))
+    send(workspace, scene / "photo.png")
     assert session.options == own
     assert (names(workspace), session.mesh_path, session.shot.box) == (["photo.png"], None, None)
     assert session.request().guess is None
-    asyncio.run(upload(workspace, scene / "truck.ply"))
+    send(workspace, scene / "truck.ply")
     assert workspace.session.mesh_facts.endswith(" ft, rendered in grey")
 
 
@@ -323,9 +343,7 @@ def test_warnings_and_defects_become_messages(workspace, capsys):
     def warn():
         warnings.warn(CurviregWarning("small", subject="a.obj"), stacklevel=1)
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        warnings.showwarning = show_warning
+    with shown_warnings():
         assert asyncio.run(workspace.run("mesh", warn)) is True
     assert workspace.messages == {"mesh": "a.obj: small"}
     assert asyncio.run(workspace.run("mesh", lambda: 5)) == 5
@@ -528,23 +546,23 @@ class FullDisk:
 
 def test_a_full_disk_is_said_and_leaves_nothing(workspace, scene, monkeypatch):
     message = r"^a\.png: cannot be stored \(No space left on device\); make room on the machine"
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     with monkeypatch.context() as patch:
         patch.setattr(Path, "open", lambda *_, **__: FullDisk())
         with pytest.raises(OutputError, match=message):
-            asyncio.run(upload(workspace, scene / "photo.png", "a.png", b"1"))
+            send(workspace, scene / "photo.png", "a.png", b"1")
     with monkeypatch.context() as patch:
         patch.setattr(
             module.tempfile,
             "mkdtemp",
-            Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")),
+            full,
         )
         with pytest.raises(OutputError, match=message):
-            asyncio.run(upload(workspace, scene / "photo.png", "a.png", b"1"))
+            send(workspace, scene / "photo.png", "a.png", b"1")
     assert (list(workspace.folder.iterdir()), workspace.receiving) == ([], {})
-    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     monkeypatch.setattr(zipfile.ZipFile, "extractall", full)
     pack(scene / "a.zip", {"a.ply": b""})
-    asyncio.run(upload(workspace, scene / "a.zip"))
+    send(workspace, scene / "a.zip")
     assert workspace.messages["mesh"].startswith(
         "a.zip: cannot be stored (No space left on device); make room"
     )
@@ -637,17 +655,3 @@ def test_unpack_refuses_folders_that_are_nested_deeply(tmp_path):
     ):
         unpack(pack(tmp_path / "a.zip", {f"{deep}a/a.ply": mesh}), tmp_path / "more")
     assert not (tmp_path / "more").exists()
-
-
-def test_a_mesh_of_a_doubtful_size_asks_for_its_unit(workspace, tmp_path):
-    """Whatever the words of the warning are."""
-    trimesh.creation.box((300.0, 200.0, 100.0)).export(tmp_path / "large.stl")
-    trimesh.creation.box((0.3, 0.2, 0.1)).export(tmp_path / "small.stl")
-    assert not workspace.asks_for_unit
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
-        warnings.showwarning = show_warning
-        asyncio.run(upload(workspace, tmp_path / "large.stl"))
-    assert workspace.asks_for_unit
-    asyncio.run(upload(workspace, tmp_path / "small.stl"))
-    assert not workspace.asks_for_unit
