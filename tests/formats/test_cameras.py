@@ -104,18 +104,20 @@ def test_opencv(tmp_path, suffix):
     check(load_camera(file), tuple(D[0]))
 
 
-def test_opencv_with_other_keys_and_bop(tmp_path):
+def test_opencv_with_other_keys_and_bop(tmp_path, read):
     file = tmp_path / "fisheye.yml"
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
     for name, value in {"cameraMatrix": K, "distCoeffs": D[0, :4], "fisheye_model": 1}.items():
         storage.write(name, value)
     storage.release()
     check(load_camera(file), tuple(D[0, :4]), model="fisheye", size=None)
-    file.write_text(file.read_text().replace("fisheye_model: 1", "fisheye_model: 0"))
-    check(load_camera(file), tuple(D[0, :4]), size=None)
+    check(
+        read(file.read_text().replace("fisheye_model: 1", "fisheye_model: 0"), "fisheye.yml"),
+        tuple(D[0, :4]),
+        size=None,
+    )
     file = tmp_path / "python.json"
-    file.write_text(json.dumps({"mtx": K.tolist(), "dist": D.tolist(), "image_size": [640, 480]}))
-    check(load_camera(file), tuple(D[0]))
+    check(read({"mtx": K.tolist(), "dist": D.tolist(), "image_size": [640, 480]}), tuple(D[0]))
     bop = {
         "cx": 321.25,
         "cy": 238.5,
@@ -125,8 +127,7 @@ def test_opencv_with_other_keys_and_bop(tmp_path):
         "height": 480,
         "width": 640,
     }
-    file.write_text(json.dumps(bop))
-    check(load_camera(file), ())
+    check(read(bop), ())
 
 
 @pytest.mark.parametrize(
@@ -138,15 +139,18 @@ def test_ros_camera_info(tmp_path, text):
     check(load_camera(file), tuple(D[0]))
 
 
-def test_other_models_of_ros(tmp_path):
+def test_other_models_of_ros(tmp_path, read):
     models = ("rational_polynomial", 8, "radial-tangential"), ("equidistant", 4, "fisheye")
     for ros_model, count, model in models:
-        file = tmp_path / f"{ros_model}.yaml"
         numbers = tuple(0.01 * k for k in range(count))
-        file.write_text(
-            ROS.replace("plumb_bob", ros_model).replace(str(D[0].tolist()), str(list(numbers)))
+        check(
+            read(
+                ROS.replace("plumb_bob", ros_model).replace(str(D[0].tolist()), str(list(numbers))),
+                f"{ros_model}.yaml",
+            ),
+            numbers,
+            model=model,
         )
-        check(load_camera(file), numbers, model=model)
 
 
 def test_kalibr(tmp_path):
@@ -254,10 +258,8 @@ JSON = {
 
 
 @pytest.mark.parametrize(("content", "distortion", "size"), JSON.values(), ids=JSON)
-def test_json_of_other_tools(tmp_path, content, distortion, size):
-    file = tmp_path / "camera.json"
-    file.write_text(json.dumps(content))
-    check(load_camera(file), distortion, size=size)
+def test_json_of_other_tools(read, content, distortion, size):
+    check(read(content), distortion, size=size)
 
 
 SINGULAR = (
@@ -272,10 +274,8 @@ SINGULAR = (
 
 
 @pytest.mark.parametrize("key", SINGULAR)
-def test_distortion_by_the_names_that_tools_give_it(tmp_path, key):
-    file = tmp_path / "camera.json"
-    file.write_text(json.dumps({"camera_matrix": MATRIX, key: [LENS]}))
-    check(load_camera(file), tuple(LENS), size=None)
+def test_distortion_by_the_names_that_tools_give_it(read, key):
+    check(read({"camera_matrix": MATRIX, key: [LENS]}), tuple(LENS), size=None)
 
 
 REFUSED = {
@@ -331,8 +331,7 @@ def test_no_distortion_is_dropped_in_silence(tmp_path, content, words):
     check_refused(tmp_path, content, words)
 
 
-def test_zero_distortion_and_distances_are_no_distortion(tmp_path):
-    file = tmp_path / "camera.json"
+def test_zero_distortion_and_distances_are_no_distortion(read):
     more = {
         "my_distortion": [0.0, 0],
         "distance": 3.0,
@@ -341,21 +340,18 @@ def test_zero_distortion_and_distances_are_no_distortion(tmp_path):
         "dist_b": "none",
         "k7": True,
     }
-    file.write_text(json.dumps({"K": MATRIX, **more}))
-    check(load_camera(file), (), size=None)
+    check(read({"K": MATRIX, **more}), (), size=None)
 
 
-def test_four_coefficients_without_a_model_are_noted(tmp_path):
-    file = tmp_path / "camera.json"
-    file.write_text(json.dumps({"K": MATRIX, "D": [[0.02], [-0.01], [0.003], [-0.001]]}))
+def test_four_coefficients_without_a_model_are_noted(read):
     with pytest.warns(
         CurviregWarning, match="read as k1, k2, p1, p2; write distortion_model: fisheye"
     ):
-        camera = load_camera(file)
+        camera = read({"K": MATRIX, "D": [[0.02], [-0.01], [0.003], [-0.001]]})
     check(camera, (0.02, -0.01, 0.003, -0.001), size=None)
 
 
-def test_numbers_alone_are_the_matrix(tmp_path):
+def test_numbers_alone_are_the_matrix(tmp_path, read):
     file = tmp_path / "cam_K.txt"
     homogeneous = np.eye(4)
     homogeneous[:3, :3] = K
@@ -369,16 +365,13 @@ def test_numbers_alone_are_the_matrix(tmp_path):
     ):
         np.savetxt(file, matrix, header="camera matrix")
         check(load_camera(file), (), size=None)
-    file.write_text(str(K.tolist()))
-    check(load_camera(file), (), size=None)
-    file.write_text("520.5 0 321.25 0 522")
+    check(read(str(K.tolist()), "cam_K.txt"), (), size=None)
     with pytest.raises(InvalidInputError, match=r"line 1: expected 'key: value'|no camera matrix"):
-        load_camera(file)
+        read("520.5 0 321.25 0 522", "cam_K.txt")
 
 
-def test_yaml_of_pyyaml_and_of_other_tools(tmp_path):
+def test_yaml_of_pyyaml_and_of_other_tools(read):
     yaml = pytest.importorskip("yaml")
-    file = tmp_path / "camera.yaml"
     content = {
         "camera_matrix": MATRIX,
         "dist_coeff": D.tolist(),
@@ -386,33 +379,42 @@ def test_yaml_of_pyyaml_and_of_other_tools(tmp_path):
         "image_height": 480,
     }
     for flow in (False, True, None):
-        file.write_text(yaml.dump(content, default_flow_style=flow))
-        check(load_camera(file), tuple(LENS))
-    file.write_text(
-        "%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 640\nimage_height: "
-        "480\ndistortion_parameters:\n"
-        "   k1: -3.1e-01\n   k2: 0.12\n   p1: 1.0e-03\n   p2: -2e-3\nprojection_parameters:\n"
-        "   fx: 520.5\n   fy: 522.0\n   cx: 321.25\n   cy: 238.5\n"
+        check(read(yaml.dump(content, default_flow_style=flow), "camera.yaml"), tuple(LENS))
+    check(
+        read(
+            "%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 640\nimage_height: "
+            "480\ndistortion_parameters:\n"
+            "   k1: -3.1e-01\n   k2: 0.12\n   p1: 1.0e-03\n   p2: -2e-3\nprojection_parameters:\n"
+            "   fx: 520.5\n   fy: 522.0\n   cx: 321.25\n   cy: 238.5\n",
+            "camera.yaml",
+        ),
+        tuple(LENS[:4]),
     )
-    check(load_camera(file), tuple(LENS[:4]))
     fisheye = (
         "   k2: 0.02\n   k3: -0.01\n   k4: 0.003\n   k5: -0.001\n   mu: 520.5\n   mv: "
         "522\n   u0: "
         "321.25\n   v0: 238.5"
     )
-    file.write_text(
-        f"%YAML:1.0\n---\nmodel_type: KANNALA_BRANDT\nimage_width: 640\nimage_height: 480\n"
-        f"projection_parameters:\n{fisheye}\n"
+    check(
+        read(
+            f"%YAML:1.0\n---\nmodel_type: KANNALA_BRANDT\nimage_width: 640\nimage_height: 480\n"
+            f"projection_parameters:\n{fisheye}\n",
+            "camera.yaml",
+        ),
+        (0.02, -0.01, 0.003, -0.001),
+        model="fisheye",
     )
-    check(load_camera(file), (0.02, -0.01, 0.003, -0.001), model="fisheye")
-    file.write_text(
-        "T_BS:\n  cols: 4\n  data: [1, 0, 0, 0,\n         0, 1, 0, 0]\nresolution: [640, "
-        "480]\ncamera_model: pinhole\n"
-        "intrinsics: [520.5, 522.0, 321.25, 238.5] #fu, fv, cu, cv\ndistortion_model: "
-        "radial-tangential\n"
-        "distortion_coefficients: [-0.31, 0.12, 0.001, -0.002]\n"
+    check(
+        read(
+            "T_BS:\n  cols: 4\n  data: [1, 0, 0, 0,\n         0, 1, 0, 0]\nresolution: [640, "
+            "480]\ncamera_model: pinhole\n"
+            "intrinsics: [520.5, 522.0, 321.25, 238.5] #fu, fv, cu, cv\ndistortion_model: "
+            "radial-tangential\n"
+            "distortion_coefficients: [-0.31, 0.12, 0.001, -0.002]\n",
+            "camera.yaml",
+        ),
+        tuple(LENS[:4]),
     )
-    check(load_camera(file), tuple(LENS[:4]))
 
 
 def test_arrays_of_numpy(tmp_path):
@@ -442,7 +444,7 @@ def test_arrays_of_objects_and_damaged_ones_are_refused(tmp_path):
         load_camera(tmp_path / "camera.pkl")
 
 
-def test_stereo_calibrations_name_two_cameras(tmp_path):
+def test_stereo_calibrations_name_two_cameras(tmp_path, read):
     file = tmp_path / "intrinsics.yml"
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
     for name, value in {"M1": K, "D1": D, "M2": 2 * K - np.diag([0, 0, 1.0]), "D2": 2 * D}.items():
@@ -457,15 +459,17 @@ def test_stereo_calibrations_name_two_cameras(tmp_path):
     ):
         load_camera(file)
     file = tmp_path / "stereo.json"
-    file.write_text(
-        json.dumps(
-            {"K_left": MATRIX, "D_left": LENS, "K_right": MATRIX, "D_right": LENS[:4], "R": [1]}
-        )
+    check(
+        read(
+            {"K_left": MATRIX, "D_left": LENS, "K_right": MATRIX, "D_right": LENS[:4], "R": [1]},
+            part="left",
+        ),
+        tuple(LENS),
+        size=None,
     )
-    check(load_camera(f"{file}:left"), tuple(LENS), size=None)
 
 
-def test_bop_scene_cameras_are_named_by_image(tmp_path):
+def test_bop_scene_cameras_are_named_by_image(tmp_path, read):
     file = tmp_path / "scene_camera.json"
     flat = K.flatten().tolist()
     other = [600.0, *flat[1:]]
@@ -476,8 +480,9 @@ def test_bop_scene_cameras_are_named_by_image(tmp_path):
         InvalidInputError, match="several cameras; choose one as FILE:NAME from 3, 12"
     ):
         load_camera(file)
-    file.write_text(json.dumps({str(number): {"cam_K": flat} for number in range(9)}))
-    check(load_camera(file), (), size=None)  # all the same
+    check(
+        read({str(number): {"cam_K": flat} for number in range(9)}), (), size=None
+    )  # all the same
 
 
 @pytest.mark.parametrize(
@@ -498,40 +503,47 @@ def test_the_camera_of_a_result_is_as_uncertain_as_it_was(tmp_path, source, devi
         assert camera.size == (480, 640)
 
 
-def test_metashape_counts_from_the_centre_and_swaps_the_tangential_coefficients(tmp_path):
-    file = tmp_path / "calibration.xml"
+def test_metashape_counts_from_the_centre_and_swaps_the_tangential_coefficients(read):
     lens = "<k1>-0.31</k1><k2>0.12</k2><k3>0.03</k3><p1>-0.002</p1><p2>0.001</p2>"
     text = (
         "<?xml version='1.0'?><calibration><projection>frame</projection><width>640</width><height>480</height>"  # noqa: E501
         f"<f>522</f><cx>1.75</cx><cy>-1</cy><b1>-1.5</b1>{lens}<date>2026-01-01T00:00:00Z</date></calibration>"
     )
-    file.write_text(text)
-    check(load_camera(file), tuple(LENS))
+    check(read(text, "calibration.xml"), tuple(LENS))
     sensor = text.split("?>")[1].replace(
         "<width>640</width><height>480</height>", '<resolution width="640" height="480"/>'
     )
     other = sensor.replace("<f>522", "<f>999")
-    file.write_text(
-        f"<document><sensor label='a'>{sensor}</sensor><sensor "
-        f"label='b'>{other}</sensor></document>"
+    check(
+        read(
+            f"<document><sensor label='a'>{sensor}</sensor><sensor "
+            f"label='b'>{other}</sensor></document>",
+            "calibration.xml",
+            part="0",
+        ),
+        tuple(LENS),
     )
-    check(load_camera(f"{file}:0"), tuple(LENS))
     for wrong in ("<b2>0.1</b2>", "<k4>0.1</k4>", "<p3>0.1</p3>"):
-        file.write_text(text.replace("<date>", f"{wrong}<date>"))
         with pytest.raises(InvalidInputError, match="of Metashape have no counterpart in OpenCV"):
-            load_camera(file)
-    file.write_text(
-        text.replace("frame", "fisheye").replace("<p1>-0.002</p1><p2>0.001</p2>", "<k4>-0.001</k4>")
+            read(text.replace("<date>", f"{wrong}<date>"), "calibration.xml")
+    check(
+        read(
+            text.replace("frame", "fisheye").replace(
+                "<p1>-0.002</p1><p2>0.001</p2>", "<k4>-0.001</k4>"
+            ),
+            "calibration.xml",
+        ),
+        (-0.31, 0.12, 0.03, -0.001),
+        model="fisheye",
     )
-    check(load_camera(file), (-0.31, 0.12, 0.03, -0.001), model="fisheye")
 
 
-def test_nerfstudio_fisheye(tmp_path):
-    file = tmp_path / "transforms.json"
-    file.write_text(
-        json.dumps({**CORNER, "camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k4": -0.001})
+def test_nerfstudio_fisheye(read):
+    check(
+        read({**CORNER, "camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k4": -0.001}),
+        (0.02, 0.0, 0.0, -0.001),
+        model="fisheye",
     )
-    check(load_camera(file), (0.02, 0.0, 0.0, -0.001), model="fisheye")
 
 
 def test_more_models_of_colmap(tmp_path):
@@ -549,13 +561,12 @@ def test_more_models_of_colmap(tmp_path):
         load_camera(f"{file}:9")
 
 
-def test_ros_region_and_binning_are_applied(tmp_path):
-    file = tmp_path / "info.yaml"
-    file.write_text(
+def test_ros_region_and_binning_are_applied(read):
+    camera = read(
         ROS + "binning_x: 2\nbinning_y: 4\nroi: {x_offset: 100, y_offset: 40, width: 400, height: "
-        "200}\n"
+        "200}\n",
+        "info.yaml",
     )
-    camera = load_camera(file)
     assert camera.size == (50, 200)
     assert camera.distortion == tuple(LENS)
     # The pixel (101, 40) of the sensor has its left edge at 100.5: the binned one at (0, 0) covers
@@ -564,46 +575,40 @@ def test_ros_region_and_binning_are_applied(tmp_path):
     y = (238.5 - 39.5) / 4 - 0.5
     expected = torch.tensor([[260.25, 0, x], [0, 130.5, y], [0, 0, 1]], dtype=torch.float64)
     torch.testing.assert_close(camera.matrix, expected)
-    file.write_text(ROS + "roi:\n  x_offset: 100\n  y_offset: 40\n")
-    assert load_camera(file).size == (440, 540)
-    file.write_text(ROS + "binning_x: 1\nroi: {x_offset: 0, y_offset: 0, width: 0, height: 0}\n")
-    check(load_camera(file), tuple(LENS))
+    assert read(ROS + "roi:\n  x_offset: 100\n  y_offset: 40\n", "info.yaml").size == (440, 540)
+    check(
+        read(
+            ROS + "binning_x: 1\nroi: {x_offset: 0, y_offset: 0, width: 0, height: 0}\n",
+            "info.yaml",
+        ),
+        tuple(LENS),
+    )
 
 
-def test_ros_rectified_camera(tmp_path):
-    file = tmp_path / "info.yaml"
-    file.write_text(ROS)
-    camera = load_camera(f"{file}:P")
+def test_ros_rectified_camera(read):
+    camera = read(ROS, "info.yaml", part="P")
     assert camera.matrix.tolist() == [[480, 0, 322], [0, 500, 239], [0, 0, 1]]
     assert (camera.distortion, camera.size) == ((), (480, 640))
-    file.write_text(ROS.replace(", 0, 0, 0, 1, 0]", "]"))
     with pytest.raises(InvalidInputError, match="projection matrix: expected 12 numbers, got 7"):
-        load_camera(f"{file}:P")
+        read(ROS.replace(", 0, 0, 0, 1, 0]", "]"), "info.yaml", part="P")
 
 
-def test_yaml_cannot_blow_up_or_run_code(tmp_path):
-    file = tmp_path / "a.yaml"
-    file.write_text("a: &a [1, 1]\nb: [*a, *a]\nK: [1]")
+def test_yaml_cannot_blow_up_or_run_code(tmp_path, read):
     with pytest.raises(InvalidInputError, match="has aliases"):
-        load_camera(file)
-    file.write_text("a: " + "[" * 1000 + "]" * 1000)
+        read("a: &a [1, 1]\nb: [*a, *a]\nK: [1]", "a.yaml")
     with pytest.raises(InvalidInputError, match=r"nested too deeply|key: value"):
-        load_camera(file)
-    file.write_text("- " * 2000 + "1")
+        read("a: " + "[" * 1000 + "]" * 1000, "a.yaml")
     with pytest.raises(InvalidInputError, match=r"nested too deeply|key: value"):
-        load_camera(file)
+        read("- " * 2000 + "1", "a.yaml")
     for depth, words in ((45, "no camera matrix"), (55, "nested too deeply")):
-        file.write_text("a: " + "[" * depth + "1" + "]" * depth)
         with pytest.raises(InvalidInputError, match=words):
-            load_camera(file)
-    file.write_text(f"a: !!python/object/apply:os.mkdir [{tmp_path}/made]\nfx: 1\n")
+            read("a: " + "[" * depth + "1" + "]" * depth, "a.yaml")
     with pytest.raises(InvalidInputError, match="expected 9 numbers, or fx, fy, cx, cy, got 1"):
-        load_camera(file)
+        read(f"a: !!python/object/apply:os.mkdir [{tmp_path}/made]\nfx: 1\n", "a.yaml")
     assert not (tmp_path / "made").exists()
 
 
-def test_messages_quote_nothing_of_a_foreign_file(tmp_path):
-    file = tmp_path / "secrets"
+def test_messages_quote_nothing_of_a_foreign_file(read):
     for text in (
         "TOKEN=abc123\nroot:x:0:0:root:/root\n",
         "abc123: [",
@@ -611,28 +616,23 @@ def test_messages_quote_nothing_of_a_foreign_file(tmp_path):
         "<abc123>",
         "abc123\n",
     ):
-        file.write_text(text)
         with pytest.raises(InvalidInputError) as error:
-            load_camera(file)
+            read(text, "secrets")
         assert "abc123" not in str(error.value)
 
 
-def test_both_coordinates_of_the_principal_point_decide_the_order_of_the_sides(tmp_path):
-    file = tmp_path / "camera.json"
+def test_both_coordinates_of_the_principal_point_decide_the_order_of_the_sides(read):
     # 262 alone would say the other order
     for cx, cy, size in ((262.0, 238.5, (480, 640)), (238.5, 262.0, (640, 480))):
         for written in ([480, 640], [640, 480]):
             matrix = [[520.5, 0, cx], [0, 522.0, cy], [0, 0, 1]]
-            file.write_text(json.dumps({"K": matrix, "resolution": written}))
-            assert load_camera(file).size == size
+            assert read({"K": matrix, "resolution": written}).size == size
 
 
-def test_distortion_beside_several_cameras_belongs_to_none_of_them(tmp_path):
-    file = tmp_path / "cameras.json"
+def test_distortion_beside_several_cameras_belongs_to_none_of_them(read):
     other = (2 * K - np.diag([0, 0, 1.0])).tolist()
-    file.write_text(json.dumps({"a": {"K": MATRIX}, "b": {"K": other}, "dist": LENS}))
     with pytest.raises(InvalidInputError, match="'dist': looks like distortion, but is not read"):
-        load_camera(f"{file}:a")
+        read({"a": {"K": MATRIX}, "b": {"K": other}, "dist": LENS}, part="a")
 
 
 @pytest.mark.parametrize(

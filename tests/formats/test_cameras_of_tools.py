@@ -103,10 +103,8 @@ JSON = {
 
 
 @pytest.mark.parametrize(("content", "distortion", "size"), JSON.values(), ids=JSON)
-def test_json_of_further_tools(tmp_path, content, distortion, size):
-    file = tmp_path / "camera.json"
-    file.write_text(json.dumps(content))
-    check_camera(load_camera(file), distortion, size)
+def test_json_of_further_tools(read, content, distortion, size):
+    check_camera(read(content), distortion, size)
 
 
 REFUSED = {
@@ -137,15 +135,12 @@ def test_what_cannot_be_read_is_named(tmp_path, content, words):
     check_refused(tmp_path, content, words)
 
 
-def test_realsense_fisheye_has_room_for_five_coefficients(tmp_path):
-    file = tmp_path / "t265.json"
+def test_realsense_fisheye_has_room_for_five_coefficients(read):
     coefficients = [0.02, -0.01, 0.003, -0.001, 0.0]
     content = {**REALSENSE, "coeffs": coefficients, "model": "Kannala Brandt4"}
-    file.write_text(json.dumps(content))
-    check_camera(load_camera(file), tuple(coefficients[:4]), VGA, model="fisheye")
-    file.write_text(json.dumps({**content, "coeffs": [*coefficients[:4], 0.5]}))
+    check_camera(read(content), tuple(coefficients[:4]), VGA, model="fisheye")
     with pytest.raises(InvalidInputError, match="expected 4 finite coefficients"):
-        load_camera(file)
+        read({**content, "coeffs": [*coefficients[:4], 0.5]})
 
 
 OPENSFM = {
@@ -173,16 +168,13 @@ def test_opensfm_counts_in_longer_sides_from_the_centre(tmp_path, name, values, 
     )
 
 
-def test_one_focal_length_counts_from_the_corner_unless_metashape_wrote_it(tmp_path):
-    file = tmp_path / "camera.json"
+def test_one_focal_length_counts_from_the_corner_unless_metashape_wrote_it(read):
     content = {"f": 520.5, "cx": 321.25, "cy": 238.5, **SIZE}
     square = np.diag([1.0, 520.5 / 522.0, 1.0]) @ K
     square[1, 2] = 238.5
-    file.write_text(json.dumps(content))
-    check_camera(load_camera(file), (), VGA, matrix=square)
+    check_camera(read(content), (), VGA, matrix=square)
     of_metashape = {**content, "cx": 1.75, "cy": -1.0, "projection": "frame"}
-    file.write_text(json.dumps(of_metashape))
-    check_camera(load_camera(file), (), VGA, matrix=square)
+    check_camera(read(of_metashape), (), VGA, matrix=square)
 
 
 def test_what_nerfstudio_says_above_its_frames_counts_for_all(tmp_path):
@@ -199,26 +191,18 @@ def test_what_nerfstudio_says_above_its_frames_counts_for_all(tmp_path):
 
 
 @pytest.mark.parametrize("text", [ORB_SLAM, ORB_SLAM_3], ids=["2", "3"])
-def test_orb_slam(tmp_path, text):
-    file = tmp_path / "TUM1.yaml"
-    file.write_text(text)
-    check_camera(load_camera(file), LENS, VGA)
+def test_orb_slam(read, text):
+    check_camera(read(text, "TUM1.yaml"), LENS, VGA)
     fisheye = text.replace("PinHole", "KannalaBrandt8").replace("p1:", "k3:").replace("p2:", "k4:")
-    file.write_text(fisheye)
-    check_camera(load_camera(file), LENS, VGA, model="fisheye")
+    check_camera(read(fisheye, "TUM1.yaml"), LENS, VGA, model="fisheye")
 
 
-def test_toml(tmp_path):
-    file = tmp_path / "calibration.toml"
-    file.write_text(ANIPOSE)
-    check_camera(load_camera(f"{file}:cam_0"), (*LENS, 0.0), VGA)
-    file = tmp_path / "SN1234.conf"
-    file.write_text(ZED)
-    check_camera(load_camera(f"{file}:LEFT_CAM_HD"), LENS, None)
+def test_toml(read):
+    check_camera(read(ANIPOSE, "calibration.toml", part="cam_0"), (*LENS, 0.0), VGA)
+    check_camera(read(ZED, "SN1234.conf", part="LEFT_CAM_HD"), LENS, None)
 
 
-def test_toml_that_takes_long_or_is_none_is_refused(tmp_path):
-    file = tmp_path / "calibration.toml"
+def test_toml_that_takes_long_or_is_none_is_refused(read):
     deep = ".".join("a" * 200)
     for text, words in (
         (f"[a]\n{deep} = 1", "too large"),
@@ -226,9 +210,8 @@ def test_toml_that_takes_long_or_is_none_is_refused(tmp_path):
         ("[image]\n\nwidth\n640\n", "neither TOML nor YAML"),
         ("[secret]\nsecret = 1\n[secret]\n", "neither TOML nor YAML"),
     ):
-        file.write_text(text)
         with pytest.raises(InvalidInputError, match=words) as caught:
-            load_camera(file)
+            read(text, "calibration.toml")
         assert "secret" not in str(caught.value)
 
 
@@ -260,11 +243,9 @@ def test_cameras_without_a_name_are_not_listed(tmp_path):
     check_camera(load_camera(f"{file}:color"), (), VGA)
 
 
-def test_what_a_download_leaves_in_place_of_a_calibration_is_named(tmp_path):
-    file = tmp_path / "camera.yaml"
-    file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n")
+def test_what_a_download_leaves_in_place_of_a_calibration_is_named(read):
     with pytest.raises(InvalidInputError, match="a pointer of Git LFS"):
-        load_camera(file)
+        read("version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n", "camera.yaml")
 
 
 MATLAB = {
@@ -286,13 +267,10 @@ MATLAB = {
     ],
     ids=["lengths", "transposed", "K"],
 )
-def test_matlab_counts_from_one_and_has_rows_first(tmp_path, matrix):
-    file = tmp_path / "camera.json"
-    file.write_text(json.dumps({**MATLAB, **matrix}))
-    check_camera(load_camera(file), LENS, VGA)
+def test_matlab_counts_from_one_and_has_rows_first(tmp_path, read, matrix):
+    check_camera(read({**MATLAB, **matrix}), LENS, VGA)
     turned = {**MATLAB, "ImageSize": [640, 480], **matrix}
-    file.write_text(json.dumps(turned))
-    assert load_camera(file).size == (640, 480), "whatever lies nearer to the principal point"
+    assert read(turned).size == (640, 480), "whatever lies nearer to the principal point"
     check_refused(tmp_path, {**MATLAB, "Skew": 0.5}, "'Skew': looks like distortion")
 
 

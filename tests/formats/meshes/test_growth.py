@@ -266,9 +266,7 @@ def test_a_texture_of_many_groups_is_unpacked_once(tmp_path, monkeypatch):
     vertices = '<vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/>'
     mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
     resources = f'<texture2d id="7" path="/3D/a.png"/>{groups}<object id="1">{mesh}</object>'
-    path = write_threemf(
-        tmp_path / "a.3mf", resources, '<item objectid="1"/>', more={"3D/a.png": picture()}
-    )
+    path = write_threemf(tmp_path / "a.3mf", resources, more={"3D/a.png": picture()})
     content = threemf._Package._content
     asked = []
 
