@@ -63,18 +63,6 @@ def test_photographs_of_one_name_keep_their_own_results(folder, register, tmp_pa
     assert rows[0]["r11"] != rows[1]["r11"]
 
 
-def test_frames_are_in_the_order_of_their_numbers(folder, register, tmp_path):
-    shots = tmp_path / "shots"
-    shots.mkdir()
-    names = ["frame-1.png", "frame-2.png", "frame-10.png", "frame-10b.png", "frame-0100.png"]
-    for name in names:
-        shutil.copy(folder / "flat.png", shots / name)
-    register(shots, folder / "truck.safetensors")
-    assert [row["photo"] for row in table(tmp_path / "out")] == [
-        str(shots / name) for name in names
-    ]
-
-
 THEIRS = ("result.json", "overlay.png", "pose.glb", *FILES)
 LISTS = ("results.csv", "results.jsonl", "index.html")
 

@@ -216,14 +216,6 @@ def test_covariance_follows_the_unit_of_the_mesh(unit, across):
     torch.testing.assert_close(found / S[:, None] / S, C, rtol=1e-4, atol=1e-9)
 
 
-@pytest.mark.parametrize("unit", [1e-3, 80.0])
-def test_long_steps_are_shortened_by_the_distance_in_any_unit(unit):
-    T = pose([0.0, 0.0, 0.0], [0.0, 0.0, 3.0 * unit])[None]
-    centre = unit * torch.tensor([0.0, 0.0, 0.5]).double()
-    step = double([[0.0, 0.0, 0.0, 0.0, 0.0, 3.5 * unit]])
-    assert ls.step_fraction(step, T, centre).tolist() == [pytest.approx(ls.MAX_TRANSLATION)]
-
-
 @pytest.mark.parametrize(("radius", "expected"), [(1.0, 6), (6.0, 6), (8.0, 4)])
 def test_directions_are_known_where_errors_of_points_and_normals_tell_less(radius, expected):
     """Against the definition: what 0.05 rad of a normal, and 0.05 radii along the line of sight,

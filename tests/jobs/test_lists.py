@@ -211,16 +211,6 @@ def test_the_camera_of_a_row_comes_before_the_guess_for_all(tmp_path):
     assert second.camera == 50.0
 
 
-def test_limits_of_a_row_come_before_those_for_all(tmp_path):
-    path = tmp_path / "list.csv"
-    path.write_text("photo,x0,y0,x1,y1,azimuth\na.png,1,2,30,40,140 220\nb.png,1,2,30,40,\n")
-    limits = {"azimuth": (0.0, 20.0), "elevation": (10.0, 30.0)}
-    options = RegisterOptions(meshes=(tmp_path / "part.stl",), limits=limits)
-    first, second = (entry.prior for entry in read_list(path, options))
-    assert (first.azimuth, second.azimuth) == ((140.0, 220.0), (0.0, 20.0))
-    assert first.elevation == second.elevation == (10.0, 30.0)
-
-
 def test_the_page_of_a_list_begins_with_the_surest_answers(tmp_path, monkeypatch):
     pose = {"rotation": torch.eye(3).tolist(), "translation": None, "warnings": [], "message": ""}
     pose |= {"digests": {"request": "r", "photo": "p"}}

@@ -84,17 +84,6 @@ def test_focal_lengths_with_small_deviations_are_right():
     assert max(ratios) < 2.5
 
 
-@pytest.mark.parametrize(("factor", "first"), [(2.0, 1), (1.1, 0)])
-def test_rivals_are_also_tried_with_the_focal_length_of_the_best(factor, first):
-    """One camera took the photograph: each begins from the other's, where these differ."""
-    focal_lengths = torch.tensor([500.0, 100.0, 500.0 * factor])
-    index, starts = camera_module._focal_starts(torch.tensor([2, 0]), focal_lengths)
-    assert index.tolist() == [2, 0, *[2, 0] * first]
-    assert starts.tolist() == pytest.approx(
-        [500.0 * factor, 500.0, *[500.0, 500.0 * factor] * first]
-    )
-
-
 def test_zoomed_poses_keep_their_images():
     T = near_scene()[2]
     describer = truck_registrar().describer
@@ -113,13 +102,6 @@ def test_zoomed_poses_keep_their_images():
     assert torch.allclose(centre[0][:2] / centre[0][2], centre[1][:2] / centre[1][2])
 
 
-def test_fields_of_view_are_across_the_longer_side():
-    wide, tall = (camera_module.possible_cameras(size) for size in ((480, 640), (640, 480)))
-    assert [float(K[0, 0]) for K in wide] == [float(K[0, 0]) for K in tall]
-    assert tall[0][:2, 2].tolist() == [239.5, 319.5]
-    assert float(wide[2][0, 0]) == pytest.approx(320 / 0.41421356, rel=1e-6)
-
-
 def test_priors_by_source():
     image, box, _ = near_scene()
     item = as_photograph(image, box, NEAR)
@@ -136,26 +118,6 @@ def test_priors_by_source():
     )
     limits = [150.0 / max(SIZE) * float(limit.exp()) for limit in (usual.low, usual.high)]
     assert limits == pytest.approx(list(focal_length.FOCAL_LIMITS))
-
-
-def test_the_deviation_joins_prior_and_photograph():
-    image, box, T = near_scene()
-    describer = truck_registrar().describer
-    crops = EdgeCrops.cut([image], box[None], 0.1)
-    one = torch.zeros(1, dtype=torch.long)
-    poses = Hypotheses.at(
-        T[None], NEAR[None], describer.centre, one, torch.zeros(1, dtype=torch.float64)
-    )
-    poses = replace(poses, covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
-    item = replace(as_photograph(image, box, NEAR), camera_source="exif")
-
-    def variance(prior):
-        known = replace(item, focal_deviation=prior)
-        return camera_module.focal_covariance(describer, crops, poses, known)[1] ** 2
-
-    photograph = variance(1e6)
-    for prior in (0.01, 0.1):
-        assert 1.0 / variance(prior) == pytest.approx(1.0 / photograph + 1.0 / prior**2, rel=1e-6)
 
 
 def test_an_unknown_principal_point_moves_the_object_with_its_ray_and_keeps_its_look():

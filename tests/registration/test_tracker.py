@@ -188,19 +188,6 @@ def test_directions_lead_from_the_centre_of_the_object():
     assert (silhouette.normals * arms).sum(dim=1).min() > 0.0
 
 
-def test_prediction_goes_on_at_constant_velocity():
-    (_, _, first), (_, _, second), (_, _, third) = frames = sequence(3)
-    follow = make_tracker(example_mesh())
-    follow.start(frames[0][0], CAMERA, first)
-    assert [T.shape for T in follow.predictions()] == [(1, 4, 4)]
-    follow.accept(follow.measure(frames[1][0], CAMERA, second))
-    predicted, last = follow.predictions()
-    assert torch.equal(last[0], second)
-    assert rotation_error(predicted[0, :3, :3], third[:3, :3]) < 0.01
-    step, error = (float((T[:3, 3] - third[:3, 3]).norm()) for T in (second, predicted[0]))
-    assert error < 0.1 * step
-
-
 def test_tracker_follows_a_generated_sequence_until_the_object_is_absent():
     frames = sequence(8)
     follow = make_tracker(example_mesh())

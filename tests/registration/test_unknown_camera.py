@@ -45,9 +45,12 @@ def evidence_of(*similarity):
 
 
 def test_cameras_that_are_tried_have_all_fields_of_view():
-    cameras = camera_module.possible_cameras((480, 640))
-    fields_of_view = [2.0 * math.degrees(math.atan(320.0 / float(K[0, 0]))) for K in cameras]
-    assert fields_of_view == pytest.approx(camera_module.FIELDS_OF_VIEW)
+    """Across the longer side."""
+    for size in ((640, 480), (480, 640)):
+        cameras = camera_module.possible_cameras(size)
+        assert cameras[0][:2, 2].tolist() == [0.5 * (size[1] - 1), 0.5 * (size[0] - 1)]
+        fields_of_view = [2.0 * math.degrees(math.atan(320.0 / float(K[0, 0]))) for K in cameras]
+        assert fields_of_view == pytest.approx(camera_module.FIELDS_OF_VIEW)
     assert list(camera_module.FIELDS_OF_VIEW) == sorted(set(camera_module.FIELDS_OF_VIEW))
     assert fields_of_view[0] < 15.0
     assert fields_of_view[-1] > 80.0
@@ -192,10 +195,10 @@ def test_fitted_focal_lengths_may_lower_scores_a_little(monkeypatch):
 
 def test_fits_also_begin_from_the_focal_length_of_another_pose():
     """If it differs by more than 0.2 of log f; the first pose from that of the second such."""
-    focal_lengths = 500.0 * torch.tensor([1.0, 1.1, 1.3, 0.7]).double()
-    chosen = torch.tensor([0, 1, 2, 3])
+    focal_lengths = 500.0 * double([9.0, 1.0, 1.1, 1.3, 0.7])
+    chosen = torch.tensor([1, 2, 3, 4])
     index, starts = camera_module._focal_starts(chosen, focal_lengths)
-    assert index.tolist() == [0, 1, 2, 3, 0, 2, 3]
+    assert index.tolist() == [1, 2, 3, 4, 1, 3, 4]
     assert starts.tolist() == pytest.approx([500.0, 550.0, 650.0, 350.0, 650.0, 500.0, 500.0])
     alone = torch.tensor([2])
     assert camera_module._focal_starts(alone, focal_lengths)[0].tolist() == [2]

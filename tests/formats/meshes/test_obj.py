@@ -66,29 +66,6 @@ def test_every_encoding_gives_the_same_mesh(tmp_path, load, encoding, first):
     assert (len(mesh.faces), mesh.extents.tolist(), texts) == (12, [3.0, 2.0, 1.0], [])
 
 
-def test_vertices_and_faces_in_turn_with_negative_indices_and_materials_that_return(tmp_path, load):
-    counted_back = "".join(
-        "f " + " ".join(str(int(i) - 9) for i in line.split()[1:]) + "\n"
-        for line in "".join(HALVES).splitlines()
-    )
-    moved = [
-        POINTS.replace("v 3", f"v {3 + shift}").replace("v 0", f"v {shift}") for shift in (0, 5, 10)
-    ]
-    parts = [
-        f"o part{k}\nusemtl m{k % 2}\n{points}{counted_back}" for k, points in enumerate(moved)
-    ]
-    (tmp_path / "a.obj").write_text("".join(parts))
-    mesh, _ = load(tmp_path / "a.obj")
-    assert (len(mesh.vertices), len(mesh.faces), mesh.extents.tolist()) == (
-        24,
-        36,
-        [13.0, 2.0, 1.0],
-    )
-    assert mesh.volume == pytest.approx(18.0, rel=1e-9) or mesh.volume == pytest.approx(
-        -18.0, rel=1e-9
-    )
-
-
 def test_materials_of_all_libraries_and_none_without_a_name(tmp_path, load):
     (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
     (tmp_path / "b c.mtl").write_text("newmtl blue\nKd 0 0 1\n")

@@ -64,9 +64,6 @@ def test_a_binary_file_that_is_cut_is_refused(tmp_path, cut):
     (tmp_path / "a.stl").write_bytes(binary()[:-cut])
     with pytest.raises(MeshError, match=r"says 12 faces and holds .*cut while it was written"):
         cr.load_mesh(tmp_path / "a.stl")
-    (tmp_path / "a.stl").write_bytes(binary(claimed=0))
-    with pytest.raises(MeshError, match="says 0 faces and holds 12: it was cut while"):
-        cr.load_mesh(tmp_path / "a.stl")
 
 
 @pytest.mark.parametrize(
@@ -124,7 +121,6 @@ def test_an_ascii_file_that_is_cut_short_says_so(tmp_path, load):
 @pytest.mark.parametrize(
     ("content", "match"),
     [
-        (ascii_stl().replace(".", ",").encode(), "decimal commas; export it with decimal points"),
         (ascii_stl(point="  vertex {:.1f} {:.1f}\n").encode(), "does not have three coordinates"),
         (
             ascii_stl(point="  vertex {:.1f} {:.1f} {:.1f} 4\n").encode(),
