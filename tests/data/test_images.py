@@ -99,6 +99,14 @@ def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
     assert K[:2, 2].tolist() == [14.5, 19.5]
 
 
+def photo_with(folder, tags):
+    """A photograph with EXIF data of a camera, whose ``tags`` are others."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0xA210: 2} | EOS | tags)
+    Image.new("RGB", (648, 432)).save(folder / "a.jpg", exif=exif)
+    return read_photo(folder / "a.jpg")
+
+
 EOS = {0x920A: 50.0, 0xA20E: 5184 / 0.894, 0xA20F: 3456 / 0.596, 0xA002: 5184, 0xA003: 3456}
 """EXIF data of a camera with a sensor of 22.7 x 15.1 mm and a lens of 50 mm."""
 
@@ -117,10 +125,7 @@ EOS = {0x920A: 50.0, 0xA20E: 5184 / 0.894, 0xA20F: 3456 / 0.596, 0xA002: 5184, 0
     ],
 )
 def test_the_size_of_the_sensor_gives_the_focal_length(tmp_path, tags, focal_35mm):
-    exif = Image.Exif()
-    exif.get_ifd(0x8769).update({0xA210: 2} | EOS | tags)
-    Image.new("RGB", (648, 432)).save(tmp_path / "a.jpg", exif=exif)
-    photo = read_photo(tmp_path / "a.jpg")
+    photo = photo_with(tmp_path, tags)
     if focal_35mm is None:
         assert photo.focal_35mm is photo.camera() is None
         return
@@ -146,10 +151,7 @@ def test_the_size_of_the_sensor_gives_the_focal_length(tmp_path, tags, focal_35m
 def test_a_digital_zoom_counts_or_makes_the_focal_length_uncertain(
     tmp_path, tags, zoom, focal, deviation
 ):
-    exif = Image.Exif()
-    exif.get_ifd(0x8769).update({0xA210: 2} | EOS | tags)
-    Image.new("RGB", (648, 432)).save(tmp_path / "a.jpg", exif=exif)
-    photo = read_photo(tmp_path / "a.jpg")
+    photo = photo_with(tmp_path, tags)
     assert photo.digital_zoom == zoom
     assert any("perhaps not in the focal" in note for note in photo.notes) == (zoom > 1)
     camera = photo.camera()

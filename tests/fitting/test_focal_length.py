@@ -100,25 +100,19 @@ def test_strong_perspective_shows_the_focal_length(wrong):
     assert float(information.variance.sqrt()) < 0.2
 
 
-def test_a_narrow_prior_holds_the_focal_length():
+@pytest.mark.parametrize(
+    ("deviation", "limit", "is_moved", "expected"),
+    [(1e-4, 1.0, False, pytest.approx(0.0, abs=1e-3)), (0.5, 0.05, True, pytest.approx(-0.05))],
+)
+def test_a_narrow_prior_or_a_limit_holds_the_focal_length(deviation, limit, is_moved, expected):
     image, box, T = near_scene()
-    guess = focal_length.scaled_cameras(NEAR[None], torch.tensor([1.35]).double().log())[0]
-    problem = fitting_problem(image, box, guess)
+    wrong = torch.tensor([1.35]).double().log()
+    problem = fitting_problem(image, box, focal_length.scaled_cameras(NEAR[None], wrong)[0])
     none = torch.zeros(1, dtype=torch.float64)
-    prior = focal_length.FocalPrior(none, 1e-4, none - 1.0, none + 1.0)
-    fit = focal_length.fit_focal_length(problem, T[None], prior, FULL_SIZE_RADII)
-    assert float(fit.log_zoom) == pytest.approx(0.0, abs=1e-3)
-
-
-def test_the_focal_length_stays_within_its_limits():
-    image, box, T = near_scene()
-    guess = focal_length.scaled_cameras(NEAR[None], torch.tensor([1.35]).double().log())[0]
-    problem = fitting_problem(image, box, guess)
-    none = torch.zeros(1, dtype=torch.float64)
-    prior = focal_length.FocalPrior(none, 0.5, none - 0.05, none + 0.05)
-    start = focal_length.moved_away(T[None], torch.tensor([1.35]).double().log(), problem.centre)
+    prior = focal_length.FocalPrior(none, deviation, none - limit, none + limit)
+    start = focal_length.moved_away(T[None], wrong, problem.centre) if is_moved else T[None]
     fit = focal_length.fit_focal_length(problem, start, prior, FULL_SIZE_RADII)
-    assert float(fit.log_zoom) == pytest.approx(-0.05, abs=1e-9)
+    assert float(fit.log_zoom) == expected
 
 
 def test_the_pull_of_a_prior_does_not_grow_beyond_its_reach():

@@ -119,25 +119,24 @@ def test_fit_may_lose_a_little_edge_support(monkeypatch, renderer, after, counts
     assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
 
 
-@pytest.mark.parametrize(("before", "counts"), [(1.0, False), (0.0, True)])
-def test_fit_must_find_more_corners_than_the_start(monkeypatch, renderer, before, counts):
-    search = _TextureRounds.round
-    monkeypatch.setattr(
-        _TextureRounds, "round", lambda *given: replace(search(*given), before=before)
-    )
-    assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
-
-
 @pytest.mark.parametrize(
-    ("coarse", "fine", "counts"), [(0.02, 0.5, False), (0.04, 0.14, False), (0.04, 0.16, True)]
+    ("before", "coarse", "fine", "counts"),
+    [
+        (1.0, 0.5, 0.5, False),  # no more than the start
+        (0.0, 0.02, 0.5, False),
+        (0.0, 0.04, 0.14, False),
+        (0.0, 0.04, 0.16, True),
+    ],
 )
-def test_fit_must_find_enough_corners(monkeypatch, renderer, coarse, fine, counts):
+def test_fit_must_find_enough_corners_and_more_than_the_start(
+    monkeypatch, renderer, before, coarse, fine, counts
+):
     search = _TextureRounds.round
     ratios = iter([coarse, fine])
     monkeypatch.setattr(
         _TextureRounds,
         "round",
-        lambda *given: replace(search(*given), before=0.0, after=next(ratios)),
+        lambda *given: replace(search(*given), before=before, after=next(ratios)),
     )
     assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
 

@@ -198,14 +198,21 @@ def test_empty_cells_beyond_the_header_of_a_rig_do_not_count(tmp_path):
     assert len(read_rig(path)) == 1
 
 
+K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
+EYE = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+CAMERA = {"cam_K": K, "cam_R_w2c": EYE, "cam_t_w2c": [0.0, 0.0, 600.0]}
+
+
+def write_scene(folder, **parts):
+    for name, content in parts.items():
+        (folder / f"scene_{name}.json").write_text(json.dumps(content))
+
+
 @pytest.mark.parametrize(
     "truth", [{"0": {"obj_id": 5}}, {"0": [5]}, {"0": ["obj_id"]}, {"0": "obj_id"}]
 )
 def test_ground_truth_of_bop_of_another_shape_is_refused(tmp_path, truth):
-    K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
-    camera = {"cam_K": K, "cam_R_w2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_w2c": [0, 0, 0]}
-    (tmp_path / "scene_camera.json").write_text(json.dumps({"0": camera}))
-    (tmp_path / "scene_gt.json").write_text(json.dumps(truth))
+    write_scene(tmp_path, camera={"0": CAMERA}, gt=truth)
     with pytest.raises(
         InvalidInputError, match=r"image 0: expected a list of objects in scene_gt\.json"
     ):
@@ -213,8 +220,7 @@ def test_ground_truth_of_bop_of_another_shape_is_refused(tmp_path, truth):
 
 
 def test_a_scene_of_bop_without_poses_of_its_cameras_is_no_rig(tmp_path):
-    K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
-    (tmp_path / "scene_camera.json").write_text(json.dumps({"7": {"cam_K": K}}))
+    write_scene(tmp_path, camera={"7": {"cam_K": K}})
     message = r"image 7: no cam_R_w2c in scene_camera\.json.* register these photographs one by one"
     with pytest.raises(InvalidInputError, match=message):
         read_rig(tmp_path)
@@ -222,10 +228,8 @@ def test_a_scene_of_bop_without_poses_of_its_cameras_is_no_rig(tmp_path):
 
 @pytest.mark.parametrize("place", [1, 3, 6])
 def test_cameras_of_bop_with_skew_are_refused(tmp_path, place):
-    K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
-    K[place] = 2.0
-    camera = {"cam_K": K, "cam_R_w2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_w2c": [0, 0, 0]}
-    (tmp_path / "scene_camera.json").write_text(json.dumps({"0": camera}))
+    skewed = [*K[:place], 2.0, *K[place + 1 :]]
+    write_scene(tmp_path, camera={"0": {**CAMERA, "cam_K": skewed}})
     with pytest.raises(InvalidInputError, match=r"image 0: cam_K in scene_camera\.json"):
         read_rig(tmp_path)
 
@@ -238,23 +242,13 @@ def test_a_photograph_of_colmap_whose_name_is_a_number_is_no_line_of_points(tmp_
 
 def test_an_object_that_a_photograph_of_bop_shows_twice_has_no_box_there(tmp_path):
     """Which of the two is meant is not known: it is searched for."""
-    camera = {
-        "cam_K": [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0],
-        "cam_R_w2c": torch.eye(3).flatten().tolist(),
-        "cam_t_w2c": [0.0, 0.0, 600.0],
-    }
     objects = {"0": [2, 1], "1": [1, 1], "2": [2]}
     truth = {key: [{"obj_id": number} for number in numbers] for key, numbers in objects.items()}
     boxes = {
         key: [{"bbox_obj": [10 * k, 5, 20, 30]} for k, _ in enumerate(numbers, start=1)]
         for key, numbers in objects.items()
     }
-    for name, content in (
-        ("scene_camera.json", dict.fromkeys(objects, camera)),
-        ("scene_gt.json", truth),
-        ("scene_gt_info.json", boxes),
-    ):
-        (tmp_path / name).write_text(json.dumps(content))
+    write_scene(tmp_path, camera=dict.fromkeys(objects, CAMERA), gt=truth, gt_info=boxes)
     found = [view.box for view in read_rig(tmp_path, Path("obj_000001.ply"))]
     assert found[0] is not None
     assert float(found[0][0]) == pytest.approx(20.0, abs=1.0), "of the second object"

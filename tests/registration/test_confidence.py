@@ -22,7 +22,6 @@ from tests._support.scenes import (
     SIZE,
     learned_registrar,
     scene,
-    truck_bank,
     truck_registrar,
 )
 
@@ -252,15 +251,6 @@ def test_confidence_does_not_depend_on_the_number_of_reported_hypotheses(seed):
     assert (len(one.hypotheses), len(two.hypotheses)) == (1, 2)
     assert torch.equal(one.rotation, two.rotation)
     assert (one.confidence_features, one.confidence) == (two.confidence_features, two.confidence)
-
-
-def test_result_of_a_bank_without_rival_views_is_at_most_as_likely_as_not():
-    image, box, _ = scene(0)
-    near = sample_views(elevations=[10])[:3]
-    bank = ViewBank.build(truck_bank().mesh, near, image_size=96, progress=False)
-    result = Registrar(bank)([image], box[None], CAMERA)[0]
-    assert result.confidence_features["ranking_share"] is None
-    assert result.confidence <= confidence.UNCOMPARED_CONFIDENCE
 
 
 @pytest.mark.parametrize("camera", [CAMERA, None])

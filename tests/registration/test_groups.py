@@ -99,26 +99,27 @@ def test_axes_agree_by_their_direction_whatever_the_turn():
     assert directions_agree(both, either, AXIS_TOLERANCE).tolist() == [True, True]
 
 
-def test_a_group_is_judged_by_its_margin_to_the_others():
+WEIGHTS = torch.tensor([1.0, 0.9, 0.95, 0.8]).double() ** 4  # of the ranked views
+
+
+def expected_of(rivals, views, **features):
+    """The probability of the first two rivals, to which these views are near."""
+    share = float(WEIGHTS[views].sum() / WEIGHTS.sum())
+    features = {**FEATURES, "ranking_share": share, **features}
+    together = float(shares(rivals.scores, exact=True)[:2].sum())
+    return pytest.approx(probability_of_any(features, exact=True) * together)
+
+
+def test_an_axis_is_judged_by_its_margin_to_the_others():
     rivals = rivals_of((0.0, 20.0), (90.0, 22.0), (0.0, -70.0), scores=[3.0, 2.9, 1.0])
     axis = axis_of(rivals, UPRIGHT, rivals.rotations[0])
     assert axis.direction.tolist() == pytest.approx(rivals.rotations[0][:, 2].tolist())
-    weights = torch.tensor([1.0, 0.9, 0.95, 0.8]).double() ** 4
-    share = float(weights[:3].sum() / weights.sum())
-    features = {**FEATURES, "margin": 2.0, "ranking_share": share, "undetermined": 0.2}
-    group = shares(rivals.scores, exact=True)[:2].sum()
-    expected = probability_of_any(features, exact=True) * float(group)
-    assert axis.probability == pytest.approx(expected)
+    assert axis.probability == expected_of(rivals, [0, 1, 2], margin=2.0, undetermined=0.2)
 
 
 def test_the_margin_of_a_pair_is_that_to_the_third():
     rivals = rivals_of((0.0, 20.0), (180.0, 20.0), (90.0, 20.0), scores=[3.0, 2.9, 1.5])
-    weights = torch.tensor([1.0, 0.9, 0.95, 0.8]).double() ** 4
-    share = float((weights[0] + weights[2]) / weights.sum())
-    features = {**FEATURES, "margin": 1.5, "ranking_share": share}
-    group = shares(rivals.scores, exact=True)[:2].sum()
-    expected = probability_of_any(features, exact=True) * float(group)
-    assert pair_probability(rivals, None) == pytest.approx(expected)
+    assert pair_probability(rivals, None) == expected_of(rivals, [0, 2], margin=1.5)
 
 
 def test_an_axis_is_reliable_only_without_doubts():

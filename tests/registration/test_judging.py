@@ -1,43 +1,23 @@
 """Judgement of fitted poses in closed cases: order, rivals, limits, doubts."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from curvireg_torch.evidence import Evidence, EvidenceWeights
-from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import judged
+from tests._support.hypotheses import evidence_of, poses_at, turned
 from tests._support.numbers import double
 from tests._support.scenes import CAMERA, SIZE
 
 HULL = 0.3 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 BOX = torch.tensor([90.0, 60.0, 150.0, 120.0])
 HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
-
-
-def turned(*degrees):
-    """(N, 3, 3) rotations of views about the vertical axis."""
-    return torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in degrees])
-
-
-def poses_at(*degrees, x=0.0):
-    R = turned(*degrees)
-    H = len(R)
-    T = transform(R, torch.tensor([x, 0.0, 5.0]).double().expand(H, 3))
-    rank = torch.zeros(H, dtype=torch.float64)
-    return Hypotheses.at(T, CAMERA.expand(H, 3, 3), torch.zeros(3).double(), torch.arange(H), rank)
-
-
-def evidence_of(**columns):
-    H = len(next(iter(columns.values())))
-    values = {field.name: torch.zeros(H, dtype=torch.float64) for field in fields(Evidence)}
-    given = {name: double(column) for name, column in columns.items()}
-    return Evidence(**{**values, **given})
 
 
 class Limits:
@@ -106,7 +86,7 @@ def order_of(result):
 
 
 def test_poses_that_merged_come_last_and_are_no_rivals():
-    evidence = evidence_of(similarity=[0.6, 0.8, 0.9, 0.85])
+    evidence = evidence_of(0.6, 0.8, 0.9, 0.85)
     poses = poses_at(0.0, 90.0, 180.0, 270.0)
     result = judgement(poses, evidence, distinct=[True, True, False, False])
     assert order_of(result) == [1, 0, 2, 3]
@@ -117,7 +97,7 @@ def test_poses_that_merged_come_last_and_are_no_rivals():
 
 
 def test_only_so_many_are_reported_and_the_others_keep_their_shares():
-    evidence = evidence_of(similarity=[0.6, 0.6, 0.6])
+    evidence = evidence_of(0.6, 0.6, 0.6)
     every = judgement(poses_at(0.0, 90.0, 180.0), evidence)
     one = judgement(
         poses_at(0.0, 90.0, 180.0), evidence, pipeline=replace(Pipeline(), hypotheses=1)
@@ -141,7 +121,7 @@ def test_poses_outside_the_limits_are_not_reported_and_contradict_them_if_they_a
 
 @pytest.mark.parametrize(("outside", "margin"), [(0.9, 0.0), (0.5, 1.0)])
 def test_without_a_rival_inside_the_one_outside_is_compared(outside, margin):
-    evidence = evidence_of(similarity=[0.6, outside])
+    evidence = evidence_of(0.6, outside)
     poses = poses_at(0.0, 90.0)
     result = judgement(poses, evidence, outside=[False, True], limits=Limits())
     assert result.confidence_features["margin"] == pytest.approx(margin)
@@ -152,7 +132,7 @@ def test_without_a_rival_inside_the_one_outside_is_compared(outside, margin):
 
 def test_views_up_to_symmetries_are_near():
     """Of views at 0, 90 and 180 degrees."""
-    evidence = evidence_of(similarity=[0.6, 0.5])
+    evidence = evidence_of(0.6, 0.5)
     poses = poses_at(0.0, 90.0)
     plain = judgement(poses, evidence).confidence_features["ranking_share"]
     assert plain == pytest.approx(1.0 / (1.0 + 0.5**4 + 0.25**4))
@@ -164,7 +144,7 @@ def test_views_up_to_symmetries_are_near():
 @pytest.mark.parametrize("siblings", [[False, True], [True, False]])
 def test_siblings_are_rivals_though_the_shape_looks_the_same(siblings):
     """A small feature of the mesh tells them apart; without one, both are one answer."""
-    evidence = evidence_of(similarity=[0.6, 0.5])
+    evidence = evidence_of(0.6, 0.5)
     poses = poses_at(0.0, 180.0)
     two = torch.stack([torch.eye(4), HALF_TURN])
     assert judgement(poses, evidence, symmetries=two).probabilities[1] == 0.0
@@ -176,7 +156,7 @@ def test_doubts_are_those_of_the_best_pose():
     poses = poses_at(0.0, 90.0)
     known = torch.diag(double([0.01, 0.04, 0.09, 1.0, 1.0, 1.0]))
     poses.covariance[1] = known
-    evidence = evidence_of(similarity=[0.5, 0.6])
+    evidence = evidence_of(0.5, 0.6)
     box = torch.tensor([-0.5, 60.0, 150.0, 120.0])
     features = judgement(
         poses, evidence, focal_deviation=0.25, box=box, printed=3.0
@@ -191,7 +171,7 @@ def test_doubts_are_those_of_the_best_pose():
 def test_a_cut_object_is_doubtful_and_warned_of():
     """Half of it lies left of the photograph, whose border is 120 px from the optical axis."""
     x = -5.0 * 120.0 / 260.0
-    result = judgement(poses_at(0.0, 90.0, x=x), evidence_of(similarity=[0.6, 0.5]))
+    result = judgement(poses_at(0.0, 90.0, x=x), evidence_of(0.6, 0.5))
     assert result.confidence_features["outside"] == pytest.approx(0.5, abs=0.05)
     assert result.warnings[:2] == ("of the photograph", "of the mesh")
     assert "outside the photograph" in result.warnings[2]
@@ -199,6 +179,6 @@ def test_a_cut_object_is_doubtful_and_warned_of():
 
 
 def test_pipelines_without_calibration_have_no_probabilities():
-    evidence = evidence_of(similarity=[0.6, 0.5])
+    evidence = evidence_of(0.6, 0.5)
     result = judgement(poses_at(0.0, 90.0), evidence, pipeline=PRESETS["classical"])
     assert result.probabilities == ()

@@ -1,34 +1,17 @@
 """Second fits of the best pose and of its close rivals, in closed cases."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from curvireg_torch.evidence import Evidence, EvidenceWeights
-from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import stages
-from curvireg_torch.registration.hypotheses import Hypotheses
-from tests._support.scenes import CAMERA
+from tests._support.hypotheses import evidence_of, poses_at
 
 MOVE = 1e-3
-
-
-def poses_at(*degrees):
-    """Of the views 0, 1, ..., turned about the vertical axis."""
-    R = torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in degrees])
-    H = len(R)
-    T = transform(R, torch.tensor([0.0, 0.0, 5.0]).double().expand(H, 3))
-    rank = torch.zeros(H, dtype=torch.float64)
-    return Hypotheses.at(T, CAMERA.expand(H, 3, 3), torch.zeros(3).double(), torch.arange(H), rank)
-
-
-def evidence_of(*similarity):
-    nothing = torch.zeros(len(similarity), dtype=torch.float64)
-    values = Evidence(*[nothing] * len(fields(Evidence)))
-    return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64))
 
 
 class Refits:
@@ -80,13 +63,30 @@ class Refits:
         return (after.T != poses.T).flatten(1).any(dim=1).tolist(), after.evidence
 
 
-def test_the_best_pose_and_its_close_rivals_are_fitted_again(monkeypatch):
-    """A score of 2.5 is 0.25 of similarity."""
+@pytest.mark.parametrize(
+    ("degrees", "similarity", "outside", "fitted", "compared"),
+    [
+        # a score of 2.5 is 0.25 of similarity
+        ((0, 90, 180, 270), (0.7, 0.9, 0.66, 0.64), None, [[1], [0, 2]], [0, 2]),
+        # the second rival is nearly the first, the fifth too many
+        (
+            (0, 90, 95, 180, 270),
+            (0.9, 0.85, 0.84, 0.83, 0.82),
+            None,
+            [[0], [1, 3]],
+            [1, 2, 3, 4],
+        ),
+        # one outside the limits is neither the best nor a rival
+        ((0, 90, 180), (0.95, 0.9, 0.85), [True, False, False], [[1], [2]], [2]),
+    ],
+)
+def test_the_best_pose_and_two_close_rivals_are_fitted_again(
+    monkeypatch, degrees, similarity, outside, fitted, compared
+):
     refit = Refits(monkeypatch, {})
-    poses = poses_at(0.0, 90.0, 180.0, 270.0)
-    moved, evidence = refit.run(poses, evidence_of(0.7, 0.9, 0.66, 0.64))
-    assert refit.fitted == [[1], [0, 2]]
-    assert refit.compared == [(1, [0, 2])]
+    moved, evidence = refit.run(poses_at(*degrees), evidence_of(*similarity), outside)
+    assert refit.fitted == fitted
+    assert refit.compared == [(fitted[0][0], compared)]
     assert not any(moved)
     assert (evidence.details == 1.0).all(), "of the comparison"
 
@@ -110,15 +110,6 @@ def test_a_pose_that_stays_keeps_its_evidence(monkeypatch):
     assert evidence.similarity.tolist() == pytest.approx([0.9, 0.85, 0.7])
 
 
-def test_two_different_rivals_are_fitted_and_all_are_compared(monkeypatch):
-    """The second is nearly the first, the fifth too many."""
-    refit = Refits(monkeypatch, {})
-    poses = poses_at(0.0, 90.0, 95.0, 180.0, 270.0)
-    refit.run(poses, evidence_of(0.9, 0.85, 0.84, 0.83, 0.82))
-    assert refit.fitted == [[0], [1, 3]]
-    assert refit.compared == [(0, [1, 2, 3, 4])]
-
-
 def test_symmetric_poses_are_no_rivals(monkeypatch):
     refit = Refits(monkeypatch, {})
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
@@ -128,11 +119,3 @@ def test_symmetric_poses_are_no_rivals(monkeypatch):
     assert refit.compared == []
     refit.run(poses_at(0.0, 180.0), evidence_of(0.9, 0.85))
     assert refit.compared == [(0, [1])]
-
-
-def test_poses_outside_the_limits_are_neither_the_best_nor_rivals(monkeypatch):
-    refit = Refits(monkeypatch, {})
-    poses = poses_at(0.0, 90.0, 180.0)
-    refit.run(poses, evidence_of(0.95, 0.9, 0.85), outside=[True, False, False])
-    assert refit.fitted == [[1], [2]]
-    assert refit.compared == [(1, [2])]

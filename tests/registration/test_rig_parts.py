@@ -2,19 +2,18 @@
 pose."""
 
 import math
-from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evidence import Evidence
 from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import rig as rig_module
 from curvireg_torch.registration.rig import ELSEWHERE, Rig, RigPhotograph, RigProblem
+from tests._support.hypotheses import evidence_of
 from tests._support.numbers import double
 
 LOST_CONFIDENCE = Pipeline().fit.lost_confidence
@@ -98,12 +97,6 @@ def photograph(index, sees):
     return SimpleNamespace(index=index, sees=lambda _, T: torch.tensor([sees] * len(T)))
 
 
-def evidence_of(*similarity):
-    nothing = torch.zeros(len(similarity), 1, dtype=torch.float64)
-    values = Evidence(*[nothing] * len(fields(Evidence)))
-    return replace(values, similarity=double(similarity)[:, None])
-
-
 @pytest.mark.parametrize(
     ("sees", "similarity", "lost"),
     [
@@ -120,7 +113,9 @@ def test_photographs_that_do_not_show_the_pose_are_named(monkeypatch, sees, simi
     monkeypatch.setattr(rig_module, "refinement_confidence", lambda known: known["similarity"])
     photographs = [photograph(index, seen) for index, seen in zip((3, 5, 8), sees, strict=True)]
     rig = rig_of(around(0.0, 90.0, 180.0), photographs=photographs)
-    answer = SimpleNamespace(evidence=evidence_of(*similarity), T=ORIGIN[None])
+    answer = SimpleNamespace(
+        evidence=evidence_of(similarity=[[value] for value in similarity]), T=ORIGIN[None]
+    )
     reasons = rig.lost(answer)
     assert sorted(reasons) == lost
     for index, reason in reasons.items():

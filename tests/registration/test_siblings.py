@@ -8,7 +8,7 @@ from unittest.mock import MagicMock
 import pytest
 import torch
 
-from curvireg_torch.evidence import Evidence, EvidenceWeights
+from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.geometry import (
     rotation_from_axis_angle,
     rotation_from_viewpoint,
@@ -18,6 +18,7 @@ from curvireg_torch.registration import judging
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import Siblings
 from curvireg_torch.registration.target import TellingSymmetries
+from tests._support.hypotheses import evidence_of
 from tests._support.numbers import double
 from tests._support.scenes import CAMERA
 
@@ -32,30 +33,26 @@ def four(similarity, compare, angles):
     poses = Hypotheses.at(T, CAMERA.expand(len(T), 3, 3), torch.zeros(3).double(), index, rank)
     different = ~torch.eye(len(T), dtype=torch.bool)
     details = double(compare)
-    poses = replace(poses, evidence=evidence(*similarity))
+    poses = replace(poses, evidence=evidence_of(*similarity))
     return Siblings(poses, details, different, EvidenceWeights())
 
 
-def evidence(*similarity):
-    nothing = Evidence.zeros(len(similarity))
-    return replace(nothing, similarity=double(similarity))
-
-
 def test_a_sibling_is_better_by_its_score_and_by_details():
-    rows = [0.80, 0.79, 0.70]
-    equal = [[0.0] * 3] * 3
-    assert four(rows, equal, [0, 90, 180]).best() == 0
-    assert four(rows, [[0, 0, 0], [0.15, 0, 0], [0, 0, 0]], [0, 90, 180]).best() == 0
-    assert four(rows, [[0, 0, 0], [0.25, 0, 0], [0, 0, 0]], [0, 90, 180]).best() == 1
-    assert four(rows, [[0, 0, 0], [0.25, 0, 0], [1.5, 0, 0]], [0, 90, 180]).best() == 2
-    assert four(rows, [[0, -9, -9], [0, 0, 0], [0, 0, 0]], [0, 90, 180]).best() == 0
+    for details, best in (
+        ([[0, 0, 0], [0, 0, 0], [0, 0, 0]], 0),
+        ([[0, 0, 0], [0.15, 0, 0], [0, 0, 0]], 0),
+        ([[0, 0, 0], [0.25, 0, 0], [0, 0, 0]], 1),
+        ([[0, 0, 0], [0.25, 0, 0], [1.5, 0, 0]], 2),
+        ([[0, -9, -9], [0, 0, 0], [0, 0, 0]], 0),
+    ):
+        assert four([0.80, 0.79, 0.70], details, [0, 90, 180]).best() == best
 
 
 def test_the_rival_is_the_best_other_sibling_that_is_far_and_looks_different():
     rows = [0.80, 0.79, 0.70, 0.60]
     equal = [[0.0] * 4] * 4
     family = four(rows, equal, [0, 20, 100, 200])
-    fitted = evidence(0.9)
+    fitted = evidence_of(0.9)
     rival, is_hidden = family.rival(0, fitted, notable=False)
     assert torch.equal(rival.T[0], family.poses.T[2]), "the nearer one is no rival"
     assert float(rival.evidence.similarity) == pytest.approx(0.8)
@@ -74,10 +71,10 @@ def test_the_rival_is_the_best_other_sibling_that_is_far_and_looks_different():
 def test_siblings_that_look_alike_are_rivals_if_the_hidden_feature_is_notable():
     family = four([0.80, 0.79, 0.70], [[0.0] * 3] * 3, [0, 20, 100])
     family = replace(family, look_different=torch.zeros(3, 3, dtype=torch.bool))
-    small, is_hidden = family.rival(0, evidence(0.9), notable=False)
+    small, is_hidden = family.rival(0, evidence_of(0.9), notable=False)
     assert len(small) == 0
     assert is_hidden
-    notable, is_hidden = family.rival(0, evidence(0.9), notable=True)
+    notable, is_hidden = family.rival(0, evidence_of(0.9), notable=True)
     assert torch.equal(notable.T[0], family.poses.T[2])
     assert is_hidden
 
@@ -104,7 +101,7 @@ class Case:
             judging,
             "with_evidence",
             lambda _, __, poses: replace(
-                poses, evidence=evidence(*measured) if len(poses) == 3 else evidence(0.95)
+                poses, evidence=evidence_of(*measured) if len(poses) == 3 else evidence_of(0.95)
             ),
         )
 
@@ -128,7 +125,7 @@ class Case:
         block.keeps = lambda poses: torch.tensor([next(answers, True)] * len(poses))
         crops = None
         outside = torch.tensor([True, False, False])
-        given = evidence(0.99, 0.9, 0.5)
+        given = evidence_of(0.99, 0.9, 0.5)
         before = replace(self.poses, evidence=given, is_outside=outside)
         after, rival, _ = judging.with_siblings(target, block, crops, before)
         assert not rival.is_outside.any()

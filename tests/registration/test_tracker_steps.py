@@ -251,27 +251,25 @@ def test_a_turn_goes_on_about_the_axes_of_the_camera():
     torch.testing.assert_close(predicted[0, :3, :3] @ B.T, B @ A.T)
 
 
-@pytest.mark.parametrize(("angle", "count"), [(7.9, 1), (8.1, 2)])
-def test_frames_from_other_directions_are_kept(monkeypatch, angle, count):
+def remembered(monkeypatch, angle, count):
+    """Places of the keyframes after ``count`` frames, the nearest of which is an angle away."""
     monkeypatch.setattr(tracking, "surface_corners", lambda *_, **__: (None, None))
-    follow = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([50.0, angle]))
+    follow = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([90.0, angle]))
     frame = SimpleNamespace(grey=None, K=K)
-    nothing = None
-    for _ in range(2):
-        Tracker._remember(follow, frame, at(), nothing)
-    assert len(follow._keyframes) == count
+    for x in range(count):
+        Tracker._remember(follow, frame, at(float(x)), None)
     assert follow._last is not None
+    return [float(keyframe.T[0, 0, 3]) for keyframe in follow._keyframes]
+
+
+@pytest.mark.parametrize(("angle", "kept"), [(7.9, [0.0]), (8.1, [0.0, 1.0])])
+def test_frames_from_other_directions_are_kept(monkeypatch, angle, kept):
+    assert remembered(monkeypatch, angle, 2) == kept
 
 
 def test_so_many_keyframes_are_kept(monkeypatch):
-    monkeypatch.setattr(tracking, "surface_corners", lambda *_, **__: (None, None))
-    follow = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([90.0]))
-    frame = SimpleNamespace(grey=None, K=K)
-    nothing = None
-    for x in range(40):
-        Tracker._remember(follow, frame, at(float(x)), nothing)
-    kept = [float(keyframe.T[0, 0, 3]) for keyframe in follow._keyframes]
-    assert kept == [float(x) for x in range(40 - tracking.MAX_KEYFRAMES, 40)], "the latest"
+    latest = [float(x) for x in range(40 - tracking.MAX_KEYFRAMES, 40)]
+    assert remembered(monkeypatch, 90.0, 40) == latest
 
 
 def test_colours_are_learned_on_both_sides_of_the_outline():

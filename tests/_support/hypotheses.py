@@ -1,0 +1,34 @@
+"""Poses beside a photograph, and evidence for them, in closed cases."""
+
+from dataclasses import fields
+
+import torch
+
+from curvireg_torch.evidence import Evidence
+from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.registration.hypotheses import Hypotheses
+from tests._support.numbers import double
+from tests._support.scenes import CAMERA
+
+
+def turned(*degrees):
+    """(N, 3, 3) rotations of views about the vertical axis."""
+    return torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in degrees])
+
+
+def poses_at(*degrees, x=0.0):
+    """Of the views 0, 1, ..., five units away and ``x`` to the right."""
+    R = turned(*degrees)
+    count = len(R)
+    T = transform(R, double([x, 0.0, 5.0]).expand(count, 3))
+    centre = double([0.0, 0.0, 0.0])
+    rank = torch.zeros(count, dtype=torch.float64)
+    return Hypotheses.at(T, CAMERA.expand(count, 3, 3), centre, torch.arange(count), rank)
+
+
+def evidence_of(*similarity, **columns):
+    """Evidence with these similarities, or columns of other names; the others are 0."""
+    columns = columns or {"similarity": similarity}
+    count = len(next(iter(columns.values())))
+    values = {field.name: torch.zeros(count, dtype=torch.float64) for field in fields(Evidence)}
+    return Evidence(**values | {name: double(column) for name, column in columns.items()})
