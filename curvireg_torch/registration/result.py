@@ -328,7 +328,8 @@ class Registration:
         mesh tells apart; "mesh 0 or 1" of meshes that are; else None."""
         if likely_meshes := self._likely_meshes:
             return f"mesh {' or '.join(str(k) for k in likely_meshes)}"
-        likely = [0, *likely_rivals(self.probabilities, self.pair_probability)]
+        pair = None if self.feature_is_hidden else self.pair_probability
+        likely = [0, *likely_rivals(self.probabilities, pair)]
         poses = [self.hypotheses[k].allocentric_rotation for k in likely]
         named = ambiguity(torch.stack(poses))
         return "several" if named is None and self.feature_is_hidden else named

@@ -417,6 +417,7 @@ def test_rivals_and_hidden_features_are_named(capsys):
         "hypotheses": [{"viewpoint": viewpoint}] * 3,
         "probabilities": [0.45, 0.44, 0.01],
         "pair_probability": None,
+        "feature_is_hidden": False,
     }
     of_pair = {"confidence": 0.63, "probabilities": [0.63, 0.31, 0.01], "pair_probability": 0.94}
     for document in (tied, tied | of_pair):
@@ -424,8 +425,8 @@ def test_rivals_and_hidden_features_are_named(capsys):
         printed = capsys.readouterr().out
         assert printed.count("could also be") == 1
         assert "flipped by 180 degrees" in printed
-    certain = {"confidence": 0.95, "probabilities": [0.95, 0.01, 0.01]}
-    _print_rivals(tied | certain | {"ambiguous": "several"})
+    certain = {"confidence": 0.85, "probabilities": [0.85, 0.1, 0.01], "pair_probability": 0.95}
+    _print_rivals(tied | certain | {"ambiguous": "several", "feature_is_hidden": True})
     printed = capsys.readouterr().out
     assert (
         printed == "right up to turns that only a small feature tells apart, which is not in view\n"

@@ -115,7 +115,9 @@ def test_a_reliable_pair_of_which_none_is_reliable_is_ambiguous():
     hypotheses = tuple(replace(h, allocentric_rotation=R) for h, R in pairs)
     result = replace(found, hypotheses=hypotheses, probabilities=(0.6, 0.29))
     assert result.ambiguous is None
-    assert replace(result, pair_probability=0.9).ambiguous == "half turn"
+    result = replace(result, pair_probability=0.9)
+    assert result.ambiguous == "half turn"
+    assert replace(result, feature_is_hidden=True).ambiguous == "several"
 
 
 def test_of_several_meshes_none_is_right_where_all_of_them_are_improbable():
