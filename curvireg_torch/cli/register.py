@@ -572,8 +572,8 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
         print(f"several meshes fit: {of_meshes}; a photograph of where they differ decides")
         return
     probabilities = document["probabilities"]
-    pair = None if document["feature_is_hidden"] else document["pair_probability"]
-    likely = likely_rivals(probabilities, pair)
+    pair = document["pair_probability"]
+    likely = likely_rivals(probabilities, pair, is_hidden=document["feature_is_hidden"])
     if not likely:
         print("right up to turns that only a small feature tells apart, which is not in view")
         return

@@ -113,9 +113,9 @@ class Benchmark(ABC):
         meshes = self.meshes(sample)
         photo = Path(sample["image_path"])
         protocol = self.protocol
-        unknown = torch.full_like(sample["box"], torch.nan)
-        visible = sample.get("box_visible", unknown)
-        box = visible if protocol.box_is == "visible" else sample["box"]
+        box = sample["box"]
+        if protocol.box_is == "visible":
+            box = sample.get("box_visible", torch.full_like(box, torch.nan))
         error = "" if meshes else "no_other_cad"
         if protocol.box is not None and not bool(box.isfinite().all()):
             error = "unknown_box"

@@ -7,8 +7,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..filters.operations import central_gradient, fill_missing, smooth
-from ..geometry.crops import crop_transforms, image_transforms, square_boxes
-from ..geometry.framing import photograph_box
+from ..geometry.crops import crop_transforms, square_boxes
+from ..geometry.framing import inside_boxes, photograph_box
 from ..rendering.contours import ContourPoints
 from ..terms import crop_photographs
 from ..utils.checks import check_pixels
@@ -242,15 +242,3 @@ class EdgeCrops:
                 inside = F.avg_pool2d(inside, factor).floor()
             self._fields[factor] = EdgeField(crops, inside)
         return self._fields[factor]
-
-
-def inside_boxes(shown: Tensor, boxes: Tensor, size: int, margin: float) -> Tensor:
-    """(B, 1, size, size) float32: 1 where crops around (B, 4) boxes lie in the boxes ``shown`` (B,
-    4), such as those of their photographs, whose border crops repeat."""
-    A = image_transforms(square_boxes(boxes, margin), size)
-    at = torch.arange(size, dtype=A.dtype)
-    x, y = (A[:, k, k, None] * at + A[:, k, 2, None] for k in (0, 1))
-    x0, y0, x1, y1 = shown.to(A).unsqueeze(-1).unbind(1)
-    across = (x >= x0) & (x <= x1)
-    down = (y >= y0) & (y <= y1)
-    return (down[:, None, :, None] & across[:, None, None, :]).float()

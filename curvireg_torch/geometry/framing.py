@@ -95,6 +95,18 @@ def around_visible(box: Tensor, size: tuple[int, int]) -> Tensor:
     return clipped(torch.cat([box[:2] - margin, box[2:] + margin]), size)
 
 
+def inside_boxes(shown: Tensor, boxes: Tensor, size: int, margin: float) -> Tensor:
+    """(B, 1, size, size) float32: 1 where crops around (B, 4) boxes lie in the boxes ``shown`` (B,
+    4), such as those of their photographs, whose border crops repeat."""
+    A = image_transforms(square_boxes(boxes, margin), size)
+    at = torch.arange(size, dtype=A.dtype)
+    x, y = (A[:, k, k, None] * at + A[:, k, 2, None] for k in (0, 1))
+    x0, y0, x1, y1 = shown.to(A).unsqueeze(-1).unbind(1)
+    across = (x >= x0) & (x <= x1)
+    down = (y >= y0) & (y <= y1)
+    return (down[:, None, :, None] & across[:, None, None, :]).float()
+
+
 @dataclass(frozen=True)
 class CropFrame:
     """What the crop of a box shows. In it, poses are compared as the photograph's camera sees them,
@@ -112,18 +124,13 @@ class CropFrame:
     def of(cls, box: Tensor, shown: Tensor, *, side: int, margin: float) -> "CropFrame":
         """The frame of the crop of a box (4,), with a ``margin`` around it, to ``side`` px, of
         which what lies in the box ``shown`` (4,) counts."""
-        square = square_boxes(box.double(), margin)
-        to_photograph = image_transforms(square, side)
-        pixels = torch.arange(side, dtype=torch.float64)
-        x = to_photograph[0, 0] * pixels + to_photograph[0, 2]
-        y = to_photograph[1, 1] * pixels + to_photograph[1, 2]
-        x0, y0, x1, y1 = shown.double()
-        inside = ((y >= y0) & (y <= y1))[:, None] & ((x >= x0) & (x <= x1))
-        return cls(crop_transforms(square, side), inside[None])
+        box = box.double()
+        inside = inside_boxes(shown[None], box[None], side, margin)[0] > 0.0
+        return cls(crop_transforms(square_boxes(box, margin), side), inside)
 
 
 def shown_in(frame: CropFrame | None, field: Tensor) -> Tensor:
-    """A field (..., S, S) without what lies outside the photograph; as it is without a frame."""
+    """A field (..., S, S) without pixels that do not count in a frame; as it is without one."""
     return field if frame is None else field * frame.inside.to(field.device)
 
 

@@ -328,8 +328,9 @@ class Registration:
         mesh tells apart; "mesh 0 or 1" of meshes that are; else None."""
         if likely_meshes := self._likely_meshes:
             return f"mesh {' or '.join(str(k) for k in likely_meshes)}"
-        pair = None if self.feature_is_hidden else self.pair_probability
-        likely = [0, *likely_rivals(self.probabilities, pair)]
+        pair = self.pair_probability
+        rivals = likely_rivals(self.probabilities, pair, is_hidden=self.feature_is_hidden)
+        likely = [0, *rivals]
         poses = [self.hypotheses[k].allocentric_rotation for k in likely]
         named = ambiguity(torch.stack(poses))
         return "several" if named is None and self.feature_is_hidden else named
@@ -557,14 +558,18 @@ class FailedRegistration:
         raise self.error
 
 
-def likely_rivals(probabilities: Sequence[float], pair_probability: float | None) -> list[int]:
+def likely_rivals(
+    probabilities: Sequence[float], pair_probability: float | None, *, is_hidden: bool = False
+) -> list[int]:
     """Numbers of the hypotheses that are nearly as probable as the first; the second is, too, where
-    the pair of both is reliable and the first alone is not."""
+    the pair of both is reliable and the first alone is not, unless what tells turns of the mesh
+    apart ``is_hidden``."""
     if not probabilities:
         return []
     first = probabilities[0]
     likely = [p >= RIVAL_FRACTION * first for p in probabilities]
-    if len(likely) > 1 and first < RELIABLE <= (pair_probability or 0.0):
+    is_pair = first < RELIABLE <= (pair_probability or 0.0)
+    if len(likely) > 1 and is_pair and not is_hidden:
         likely[1] = True
     return [k for k, is_likely in enumerate(likely) if is_likely and k > 0]
 

@@ -11,10 +11,10 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.fitting import contour_fit
 from curvireg_torch.fitting.contour_fit import fit_to_edges, short_fit
 from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
-from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask, inside_boxes
+from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask
 from curvireg_torch.fitting.least_squares import apply_twist, project
 from curvireg_torch.fitting.measured_fit import contour_support
-from curvireg_torch.geometry.framing import photograph_box
+from curvireg_torch.geometry.framing import inside_boxes, photograph_box
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
