@@ -10,6 +10,7 @@ from curvireg_torch.geometry.framing import (
     CropFrame,
     border_sides,
     clipped,
+    inside_boxes,
     outside_fraction,
     photograph_box,
     shown_in,
@@ -126,3 +127,15 @@ def test_half_of_an_object_at_the_border_gives_its_pose(seed):
     visible = torch.tensor([box[0], box[1], end - 0.5, box[3]])
     result = learned_registrar()([image[..., :end]], visible[None], CAMERA)[0]
     assert errors(result, T)[0] < 10.0
+
+
+def test_pixels_of_a_crop_count_from_the_first_to_the_last_one_of_a_box():
+    """Pixel k of a crop of 64 px is pixel k + 10 of the photograph."""
+    shown = torch.tensor([[20.0, 30.0, 60.0, 71.0], [20.4, 30.4, 59.6, 70.6]])
+    boxes = torch.tensor([9.5, 9.5, 73.5, 73.5]).double().expand(2, 4)
+    expected = torch.zeros(2, 1, 64, 64)
+    expected[0, 0, 20:62, 10:51] = 1.0
+    expected[1, 0, 21:61, 11:50] = 1.0
+    assert torch.equal(inside_boxes(shown, boxes, 64, 0.0), expected)
+    frame = CropFrame.of(boxes[0], shown[0], side=64, margin=0.0)
+    assert torch.equal(frame.inside, expected[0] > 0)
