@@ -48,13 +48,13 @@ def _open_bank(
     pipeline: "Pipeline",
     progress: bool | Callable[[str, int, int], object],
 ) -> "ViewBank":
-    from ..matching import ViewBank, cached_bank
+    from ..matching import cached_bank
 
     if mesh.suffix != ".safetensors":
         loaded = options.load_mesh(mesh)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
-    bank = ViewBank.load(mesh)
-    check_bank(bank, mesh, unit=options.unit if options.unit_is_given else None, up=options.up)
+    unit = options.unit if options.unit_is_given else None
+    bank = load_bank(mesh, unit=unit, up=options.up)
     if options.pose not in (None, bank.pipeline.views.pose):
         built = (
             "given views"
@@ -66,10 +66,13 @@ def _open_bank(
     return bank
 
 
-def check_bank(bank: "ViewBank", path: Path, *, unit: str | None, up: str | None) -> None:
-    """Refuse a unit or an axis that is not that of the bank's mesh; None is not given."""
+def load_bank(path: Path, *, unit: str | None, up: str | None) -> "ViewBank":
+    """The bank of a file; refuses a unit or an axis that is not that of its mesh, unless it is
+    None."""
+    from ..matching import ViewBank
     from ..mesh.mesh import mesh_unit, mesh_up
 
+    bank = ViewBank.load(path)
     built_unit = mesh_unit(bank.mesh)
     built_up = mesh_up(bank.mesh)
     if unit not in (None, built_unit):
@@ -79,3 +82,4 @@ def check_bank(bank: "ViewBank", path: Path, *, unit: str | None, up: str | None
     if up not in (None, built_up):
         message = f"built with {built_up} up, not {up}; leave the axis out, or build it again"
         raise BankError(message, subject=path, kind="bank up")
+    return bank

@@ -18,7 +18,6 @@ from ..data.images import photo_of_picture
 from ..errors import CurviregError, InvalidInputError
 from ..geometry import Camera, camera_matrix
 from ..geometry.pose_prior import PosePrior
-from ..matching import ViewBank
 from ..mesh import load_mesh
 from ..mesh.mesh import mesh_unit
 from ..pipeline import Pipeline
@@ -33,7 +32,7 @@ from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
 from .documents import detection_document, result_document
 from .entry import Entry, Observation, observe, start_in_unit
-from .opening import check_bank
+from .opening import load_bank
 from .outputs import output_folder
 from .result_files import write_result
 from .views import View, register_views
@@ -144,45 +143,36 @@ def register(
         >>> result.quaternion.shape, result.overlay().shape
         (torch.Size([4]), (720, 960, 3))
     """
-    name = ""
-    path = Path()
-    meshes: tuple[Path, ...] = ()
+    entry = Entry(box=box, camera=_camera(camera), mask=mask, prior=prior)
     if isinstance(image, str | PathLike):
-        path = Path(image)
-        name = str(image)
+        entry = replace(entry, name=str(image), photo=Path(image))
         photo = read_photo(image)
+    elif isinstance(image, Image.Image):
+        photo = photo_of_picture(image)
     else:
-        photo = (
-            photo_of_picture(image)
-            if isinstance(image, Image.Image)
-            else Photo(as_photograph(image, None).image, 1, None, ())
-        )
-    if isinstance(camera, str | PathLike):
-        camera = camera if camera == "exif" else load_camera(camera)
-    elif camera is not None and not isinstance(camera, Camera):
-        K: Any = camera
-        is_short = isinstance(camera, Sequence) and len(camera) == 4
-        camera = Camera(camera_matrix(*K) if is_short else K)
+        photo = Photo(as_photograph(image, None).image, 1, None, ())
     if isinstance(mesh, str | PathLike):
-        meshes = (Path(mesh),)
-        if meshes[0].suffix == ".safetensors":
-            mesh = ViewBank.load(mesh)
-            check_bank(mesh, meshes[0], unit=unit, up=up)
-        else:
-            mesh = load_mesh(mesh, unit=unit, up=up)
+        entry = replace(entry, meshes=(Path(mesh),))
+        load = load_bank if Path(mesh).suffix == ".safetensors" else load_mesh
+        mesh = load(Path(mesh), unit=unit, up=up)
     elif unit is not None or up is not None:
         raise InvalidInputError(
             "unit, up: of a mesh file; what is given as mesh has its own, leave them out"
         )
-    registrar = (
-        mesh
-        if isinstance(mesh, Registrar)
-        else Registrar(mesh, pipeline=pipeline, progress=progress)
-    )
-    entry = Entry(
-        name=name, photo=path, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior
-    )
-    return register_observation(observe(entry, photo), registrar)
+    if not isinstance(mesh, Registrar):
+        mesh = Registrar(mesh, pipeline=pipeline, progress=progress)
+    return register_observation(observe(entry, photo), mesh)
+
+
+def _camera(given: CameraLike | str | PathLike[str] | None) -> Camera | str | None:
+    """The camera of :func:`register`; "exif" stays this word."""
+    if given is None or isinstance(given, Camera):
+        return given
+    if isinstance(given, str | PathLike):
+        return "exif" if given == "exif" else load_camera(given)
+    K: Any = given
+    is_short = isinstance(given, Sequence) and len(given) == 4
+    return Camera(camera_matrix(*K) if is_short else K)
 
 
 def register_observation(

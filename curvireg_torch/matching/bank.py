@@ -223,31 +223,26 @@ class ViewBank:
         else:
             pipeline = pipeline.with_pose_prior("given")
         describe = ViewDescriber(mesh, pipeline.bank, renderer=renderer, device=device)
-        rotations = views.rotations
-        distances = views.distance * mesh_radius(mesh)
         term = pipeline.stored_appearance(len(views))
         appearance = None if term is None else term.build().to(device)
 
-        on_cpu = torch.device(device).type == "cpu"
-        at_a_time = views_at_a_time(describe.settings.image_size) if on_cpu else VIEWS_ON_DEVICE
-
-        def describe_chunk(start: int) -> dict[str, Tensor]:
-            chunk = (
-                rotations[start : start + at_a_time],
-                distances[start : start + at_a_time],
-            )
-            tensors = packed(describe(*chunk))
+        def describe_chunk(rotations: Tensor, distances: Tensor) -> dict[str, Tensor]:
+            tensors = packed(describe(rotations, distances))
             if appearance is not None:
-                tensors["appearance"] = appearance.describe(describe.shaded(*chunk)).half()
+                shaded = describe.shaded(rotations, distances)
+                tensors["appearance"] = appearance.describe(shaded).half()
             return tensors
 
+        on_cpu = torch.device(device).type == "cpu"
+        at_a_time = views_at_a_time(pipeline.bank.image_size) if on_cpu else VIEWS_ON_DEVICE
+        distances = views.distance * mesh_radius(mesh)
+        chunks = views.rotations.split(at_a_time), distances.split(at_a_time)
         parts = []
         with (
             tqdm(total=len(views), desc="views", unit="view", disable=progress is not True) as bar,
             single_threaded_pool() if on_cpu else nullcontext() as pool,
         ):
-            map_chunks = map if pool is None else pool.map
-            for part in map_chunks(describe_chunk, range(0, len(views), at_a_time)):
+            for part in (map if pool is None else pool.map)(describe_chunk, *chunks):
                 parts.append(part)
                 bar.update(len(part["boxes"]))
                 if callable(progress):
@@ -335,26 +330,7 @@ class ViewBank:
         if not path.is_file():
             raise MissingFileError("no such bank; build one", subject=path, kind="bank")
         try:
-            with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                if metadata.get("format") != FORMAT:
-                    raise BankError(
-                        "not a view bank; build one",
-                        subject=path,
-                        kind="bank",
-                    )
-                if (version := metadata.get("version")) != str(FORMAT_VERSION):
-                    message = (
-                        f"bank format {version}, this library reads {FORMAT_VERSION}; {REBUILD}"
-                    )
-                    raise BankError(message, subject=path, kind="bank")
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-            if metadata["checksum"] != tensor_checksum(tensors):
-                raise BankError(
-                    f"changed since it was written (its checksum differs); {REBUILD}",
-                    subject=path,
-                    kind="bank",
-                )
+            tensors, metadata = _contents(path)
             pipeline = Pipeline.from_json(metadata["pipeline"])
             views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
             tensors["descriptors"] = tensors["descriptors"].float()
@@ -365,8 +341,8 @@ class ViewBank:
             )
             _check_contents(views, pipeline.bank, tensors)
             packings = _packings(tensors, json.loads(metadata["packing"]), len(views))
-        except BankError:
-            raise
+        except BankError as error:
+            raise error.with_subject(path) from None
         except (SafetensorError, OSError) as error:
             raise BankError(
                 f"truncated or not a safetensors file ({error}); {REBUILD}",
@@ -382,6 +358,22 @@ class ViewBank:
         bank = cls(mesh, views, pipeline, tensors)
         bank._packings = packings
         return bank.to(device)
+
+
+def _contents(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a bank's file, unchanged since it was written."""
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata() or {}
+        if metadata.get("format") != FORMAT:
+            raise BankError("not a view bank; build one", kind="bank")
+        if (version := metadata.get("version")) != str(FORMAT_VERSION):
+            message = f"bank format {version}, this library reads {FORMAT_VERSION}; {REBUILD}"
+            raise BankError(message, kind="bank")
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    if metadata["checksum"] != tensor_checksum(tensors):
+        message = f"changed since it was written (its checksum differs); {REBUILD}"
+        raise BankError(message, kind="bank")
+    return tensors, metadata
 
 
 def views_at_a_time(image_size: int) -> int:

@@ -131,38 +131,44 @@ def cached_bank(
         return build()
     key = bank_key(mesh, views, pipeline=pipeline, renderer=renderer)
     path = folder / "banks" / f"bank-{key}.safetensors"
+    bank = None
     with suppress(BankError, FileNotFoundError):  # damaged, or not there: build it
         bank = ViewBank.load(path, device=device)
-        if bank_key(bank.mesh, bank.views, pipeline=bank.pipeline, renderer=renderer) == key:
-            with suppress(OSError):  # a read-only cache
-                os.utime(path)
-            # the file may have been stored in another unit, or of another file of this surface
-            bank.mesh.units = mesh.units
-            bank.mesh.metadata["warnings"] = mesh_warnings(mesh)
-            bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
-            bank.described_views_file = (
-                _described_views_file(path) if bank.device.type == "cpu" else None
-            )
-            return bank
-    bank = build()
-    bank.pipeline = pipeline
-    # as the file stores them, so that both rank alike
-    bank.descriptors = bank.descriptors.half().float()
+        if bank_key(bank.mesh, bank.views, pipeline=bank.pipeline, renderer=renderer) != key:
+            bank = None
+    is_new = bank is None
+    if bank is None:
+        bank = build()
+        # as the file stores them, so that both rank alike
+        bank.descriptors = bank.descriptors.half().float()
+    else:
+        with suppress(OSError):  # a read-only cache
+            os.utime(path)
+        # the file may have been stored in another unit, or of another file of this surface
+        bank.mesh.units = mesh.units
+        bank.mesh.metadata["warnings"] = mesh_warnings(mesh)
+    bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
     bank.described_views_file = _described_views_file(path) if bank.device.type == "cpu" else None
+    if is_new:
+        _store(bank, path)
+    return bank
+
+
+def _store(bank: ViewBank, path: Path) -> None:
+    """Write a bank into the cache, and trim this; a warning tells what is impossible."""
     try:
         bank.save(path)
-        _trim(folder, keep=path)
+        _trim(path.parents[1], keep=path)
     except OutputError as error:
         warning = (
             f"the bank is not cached, so it will be built again: {error}, by CURVIREG_CACHE=FOLDER"
         )
-        warnings.warn(warning, stacklevel=2)
+        warnings.warn(warning, stacklevel=3)
     except OSError as error:  # files may be added to the folder, but not removed
         warning = (
             f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})"
         )
-        warnings.warn(warning, stacklevel=2)
-    return bank
+        warnings.warn(warning, stacklevel=3)
 
 
 def list_cache(folder: Path | None = None) -> list[CachedBank]:

@@ -180,26 +180,28 @@ def as_photographs(
 
     def item(i: int) -> Photograph | CurviregError:
         try:
-            box = given[i]
-            item = as_photograph(images[i], box, cameras[i], priors[i], masks[i])
-            if (side := _visible_side(item.box, item.size)) < MIN_BOX_SIDE:
-                if box is not None and float(box.abs().max()) <= MAX_FRACTION:
-                    raise InvalidInputError(FRACTIONS, kind="fractions")
-                small = min(item.size) < MIN_BOX_SIDE
-                where = (
-                    "the photograph has" if small else "the part of the photograph in the box has"
-                )
-                message = (
-                    f"{side:.1f} px on its shorter side, at least {MIN_BOX_SIDE} are "
-                    f"needed; use "
-                    f"a larger picture"
-                )
-                raise InvalidInputError(f"{where} {message}")
+            item = as_photograph(images[i], given[i], cameras[i], priors[i], masks[i])
+            _check_side(item, given[i])
             return item
         except CurviregError as error:
             return error.of_image(i)
 
     return OnDemand(item, n)
+
+
+def _check_side(item: Photograph, given: Tensor | None) -> None:
+    """Refuse a photograph of which too little lies in its box, which was ``given``, or None."""
+    side = _visible_side(item.box, item.size)
+    if side >= MIN_BOX_SIDE:
+        return
+    if given is not None and float(given.abs().max()) <= MAX_FRACTION:
+        raise InvalidInputError(FRACTIONS, kind="fractions")
+    is_small = min(item.size) < MIN_BOX_SIDE
+    where = "the photograph" if is_small else "the part of the photograph in the box"
+    raise InvalidInputError(
+        f"{where} has {side:.1f} px on its shorter side, at least {MIN_BOX_SIDE} are needed; use a "
+        f"larger picture"
+    )
 
 
 def check_cameras(images: Any, camera_matrices: CameraLike | None, what: str) -> None:
@@ -310,7 +312,8 @@ def as_photograph(
 ) -> Photograph:
     """One photograph in any form, with its (4,) box (None: that of the mask, or the whole image),
     however small."""
-    (pixels, recorded), notes = _pixels(image), []
+    pixels, recorded = _pixels(image)
+    notes = []
     camera = recorded if camera is None else camera
     box = None if box is None else box.detach().float().cpu()
     mask = None if mask is None else _object_mask(mask, pixels)
@@ -332,15 +335,7 @@ def as_photograph(
         source = camera.source
         camera = camera.matrix
     if mask is not None:
-        white = mask >= 0.5
-        if not bool((white if box is None else _inside(white, box)).any()):
-            where = "" if box is None else " in the box"
-            raise InvalidInputError(
-                f"mask: no white pixel{where}; expected the object white, all else black"
-            )
-        y, x = white.nonzero().unbind(1)
-        around = torch.stack([x.min() - 0.5, y.min() - 0.5, x.max() + 0.5, y.max() + 0.5])
-        box = around if box is None else box
+        box = _box_of_mask(mask, box)
     box = whole_image_box(pixels).cpu() if box is None else box
     check_boxes(box[None], [(int(pixels.shape[-2]), int(pixels.shape[-1]))])
     if camera is not None:
@@ -378,6 +373,21 @@ def _object_mask(mask: Any, image: Tensor) -> Tensor:
             "mask: expected values from 0 to 1, the object white; divide by the largest"
         )
     return x
+
+
+def _box_of_mask(mask: Tensor, box: Tensor | None) -> Tensor:
+    """The box (4,) that was given, which must show some of the object, or that around its mask
+    (H, W)."""
+    white = mask >= 0.5
+    if not bool((white if box is None else _inside(white, box)).any()):
+        where = "" if box is None else " in the box"
+        raise InvalidInputError(
+            f"mask: no white pixel{where}; expected the object white, all else black"
+        )
+    if box is not None:
+        return box
+    y, x = white.nonzero().unbind(1)
+    return torch.stack([x.min() - 0.5, y.min() - 0.5, x.max() + 0.5, y.max() + 0.5])
 
 
 def _inside(pixels: Tensor, box: Tensor) -> Tensor:

@@ -173,85 +173,95 @@ def refine_one(
 ) -> Registration:
     """Refine (S, 4, 4) starts in one photograph, see :func:`refine`; the confidence is at most
     ``limit``. Raises :class:`LostObjectError` where the object is not near any start."""
-    describer = target.describer
-    K = item.K
-    boxes, visible = boxes_at(describer.hull, T, K, item.size)
-    if not bool(visible.any()):
-        raise why_outside(describer.hull, T[0], K, item.size) or LostObjectError(OUTSIDE)
-    T = T[visible]
-    boxes = boxes[visible]
-    if float((boxes[:, 2:] - boxes[:, :2]).amin(dim=1).max()) < MIN_BOX_SIDE:
-        problem = why_outside(describer.hull, T[0], K, item.size)
-        tiny = f"at the start the mesh is less than {MIN_BOX_SIDE} px wide; check unit and distance"
-        raise problem or LostObjectError(tiny)
-    images = [item.image] * len(T)
-    each = torch.arange(len(T))
-    query = target.matcher.query(images, boxes.float())
-    check_crop(query.crops[0])
-    descriptors = describer.descriptor(query.field)
-    poses = Hypotheses.at(
-        T, K.expand(len(T), 3, 3), describer.centre, each, torch.zeros(len(T), dtype=torch.float64)
-    )
-    views = torch.tensor([nearest_view(target, R) for R in poses.rotation])
-    poses = replace(poses, photograph=each, view=views)
-    mask = target.object_mask(query, [item] * len(T))
-    crops = EdgeCrops.cut(images, boxes.float(), describer.settings.margin, mask)
     settings = target.pipeline.fit
-    wide_angles = settings.wide_angles
-    poses = fit_poses(describer, crops, poses, settings=settings, wide_angles=wide_angles)
-
-    described = Described(
-        query=query,
-        rankings=[Ranking.none()] * len(T),
-        descriptor=descriptors,
-        crops=crops,
-        keypoints=[None] * len(T),
-        frames=[None] * len(T),
-    )
-    weights = target.score_weights(exact=True)
-    best = evidence_of(target, described, poses).scores(weights).argmax()[None]
-    if (fitted := fit_texture_of(describer, crops, poses[best])) is not None:
-        poses = poses.replaced(best, fitted)
+    T, boxes = _seen_starts(target, item, T)
+    described, crops = _described(target, item, boxes)
+    poses = _fitted(target, item, described, crops, T)
     evidence = evidence_of(target, described, poses)
-    scores = evidence.scores(weights)
+    scores = evidence.scores(target.score_weights(exact=True))
     symmetries = target.symmetries_of(exact=True)
     distinct = distinct_poses(poses, scores, symmetries, angle=settings.same_pose_angle)
-    order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
+    order = scores.argsort(descending=True, stable=True)
+    order = order[distinct[order]]
+    best = order[:1]
     if item.focal_deviation:
-        first = torch.tensor(order[:1])
-        covariance, deviation = focal_covariance(describer, crops, poses[first], item)
-        poses = replace(poses, covariance=poses.covariance.index_copy(0, first, covariance))
+        covariance, deviation = focal_covariance(target.describer, crops, poses[best], item)
+        poses = replace(poses, covariance=poses.covariance.index_copy(0, best, covariance))
         item = replace(item, focal_deviation=deviation)
-    hypotheses = tuple(hypothesis_of(poses, h, evidence.named(h)) for h in order)
+    hypotheses = tuple(hypothesis_of(poses, h, evidence.named(h)) for h in order.tolist())
     features = {name: hypotheses[0].evidence[name] for name in ("similarity", "edge_support")}
     confidence = refinement_confidence(features)
     if confidence < settings.lost_confidence:
         raise LostObjectError(
             f"the object is not near the start (edge support {features['edge_support']:.2f}, "
-            f"similarity "
-            f"{features['similarity']:.2f}); give another start, or register it again"
+            f"similarity {features['similarity']:.2f}); give another start, or register it again"
         )
     probabilities: tuple[float, ...] = ()
     if is_calibrated(target.pipeline):
-        confidence = min(
-            confidence, _registered_probability(target, item, poses[torch.tensor(order[:1])])
-        )
-        probabilities = (
-            confidence if limit is None else min(confidence, limit),
-            *[0.0] * (len(hypotheses) - 1),
-        )
-    warnings = item.warnings + target.mesh_warnings
-    notes = target.mesh_notes
+        registered = _registered_probability(target, item, poses[best])
+        probability = min(confidence, registered, 1.0 if limit is None else limit)
+        probabilities = (probability, *[0.0] * (len(hypotheses) - 1))
     return Registration(
         hypotheses,
         probabilities,
         Ranking.none(),
         dict(features),
-        warnings=warnings,
-        notes=notes,
+        warnings=item.warnings + target.mesh_warnings,
+        notes=target.mesh_notes,
         camera=item.camera,
         reliable_from=settings.reliable,
     )
+
+
+def _seen_starts(target: Target, item: Photograph, T: Tensor) -> tuple[Tensor, Tensor]:
+    """The starts (N, 4, 4) that show the mesh in the photograph, and its boxes (N, 4) at them."""
+    hull = target.describer.hull
+    boxes, visible = boxes_at(hull, T, item.K, item.size)
+    if not bool(visible.any()):
+        raise why_outside(hull, T[0], item.K, item.size) or LostObjectError(OUTSIDE)
+    T = T[visible]
+    boxes = boxes[visible]
+    if float((boxes[:, 2:] - boxes[:, :2]).amin(dim=1).max()) < MIN_BOX_SIDE:
+        tiny = f"at the start the mesh is less than {MIN_BOX_SIDE} px wide; check unit and distance"
+        raise why_outside(hull, T[0], item.K, item.size) or LostObjectError(tiny)
+    return T, boxes
+
+
+def _described(target: Target, item: Photograph, boxes: Tensor) -> tuple[Described, EdgeCrops]:
+    """A photograph in each of some boxes (N, 4), as N photographs, and their crops."""
+    count = len(boxes)
+    images = [item.image] * count
+    query = target.matcher.query(images, boxes.float())
+    check_crop(query.crops[0])
+    mask = target.object_mask(query, [item] * count)
+    crops = EdgeCrops.cut(images, boxes.float(), target.describer.settings.margin, mask)
+    described = Described(
+        query=query,
+        rankings=[Ranking.none()] * count,
+        descriptor=target.describer.descriptor(query.field),
+        crops=crops,
+        keypoints=[None] * count,
+        frames=[None] * count,
+    )
+    return described, crops
+
+
+def _fitted(
+    target: Target, item: Photograph, described: Described, crops: EdgeCrops, T: Tensor
+) -> Hypotheses:
+    """Contours fitted around starts (N, 4, 4), each in its own crop, and texture at the best."""
+    describer = target.describer
+    settings = target.pipeline.fit
+    each = torch.arange(len(T))
+    ranks = torch.zeros(len(T), dtype=torch.float64)
+    poses = Hypotheses.at(T, item.K.expand(len(T), 3, 3), describer.centre, each, ranks)
+    views = torch.tensor([nearest_view(target, R) for R in poses.rotation])
+    poses = replace(poses, photograph=each, view=views)
+    poses = fit_poses(describer, crops, poses, settings=settings, wide_angles=settings.wide_angles)
+    weights = target.score_weights(exact=True)
+    best = evidence_of(target, described, poses).scores(weights).argmax()[None]
+    fitted = fit_texture_of(describer, crops, poses[best])
+    return poses if fitted is None else poses.replaced(best, fitted)
 
 
 def _registered_probability(target: Target, item: Photograph, pose: Hypotheses) -> float:

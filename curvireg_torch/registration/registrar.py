@@ -117,55 +117,25 @@ class Registrar(Target):
             check_option(mesh_is, MESH_KINDS, "mesh_is")
         if symmetries is not None:
             check_symmetries(symmetries)
-        source: Any = bank_or_mesh
-        self.others = []
-        if isinstance(source, list | tuple):
-            meshes = list(source)
-            if not meshes:
-                raise InvalidInputError("Registrar: expected a mesh or several, got an empty list")
-            if len(meshes) > 1 and not isinstance(renderer, str):
-                raise InvalidInputError(
-                    f"renderer: a custom renderer knows one mesh, got {len(meshes)}; give a name"
-                )
-            same: dict[str, Any] = {
-                "pipeline": pipeline,
-                "views": views,
-                "settings": settings,
-                "field": field,
-            }
-            same |= {
-                "renderer": renderer,
-                "mesh_is": mesh_is,
-                "symmetries": symmetries,
-                "device": device,
-            }
-            self.others = [Registrar(mesh, **same, progress=progress) for mesh in meshes[1:]]
-            source = meshes[0]
-        matcher: ViewMatcher = source
-        if isinstance(source, ViewMatcher):
-            if any(value is not None for value in (pipeline, field, views, settings)):
-                raise InvalidInputError(
-                    "Registrar: pipeline, field, views and settings belong to the matcher"
-                )
-        else:
-            if not isinstance(bank := source, ViewBank):
-                pipeline = pipeline or Pipeline()
-                pipeline = replace(pipeline, bank=settings or pipeline.bank)
-                built: dict[str, Any] = {
-                    "pipeline": pipeline,
-                    "renderer": renderer,
-                    "progress": progress,
-                    "device": device or "cpu",
-                }
-                bank = cached_bank(source, views, **built)
-            elif views is not None or settings is not None:
-                raise InvalidInputError(
-                    "Registrar: views and settings belong to the bank; give them with a mesh only"
-                )
-            bank = bank if device is None else bank.to(device)
-            options: dict[str, Any] = {"pipeline": pipeline, "field": field, "renderer": renderer}
-            matcher = ViewMatcher(bank, **options)
-        super().__init__(matcher, mesh_is=mesh_is, symmetries=symmetries, progress=progress)
+        meshes = list(bank_or_mesh) if isinstance(bank_or_mesh, list | tuple) else [bank_or_mesh]
+        if not meshes:
+            raise InvalidInputError("Registrar: expected a mesh or several, got an empty list")
+        if len(meshes) > 1 and not isinstance(renderer, str):
+            raise InvalidInputError(
+                f"renderer: a custom renderer knows one mesh, got {len(meshes)}; give a name"
+            )
+        same: dict[str, Any] = {
+            "pipeline": pipeline,
+            "views": views,
+            "settings": settings,
+            "field": field,
+            "renderer": renderer,
+            "device": device,
+            "progress": progress,
+        }
+        known: dict[str, Any] = {"mesh_is": mesh_is, "symmetries": symmetries}
+        self.others = [Registrar(mesh, **same, **known) for mesh in meshes[1:]]
+        super().__init__(_matcher_of(meshes[0], **same), **known, progress=progress)
         self.workers = Workers(workers, executor) if workers > 1 or executor is not None else None
         if self.workers is not None and self.bank.device.type != "cpu":
             raise InvalidInputError(
@@ -275,6 +245,43 @@ class Registrar(Target):
         if isinstance(result, FailedRegistration):
             raise result.error
         return result
+
+
+def _matcher_of(
+    source: Any,
+    *,
+    pipeline: Pipeline | None,
+    views: ViewSphere | None,
+    settings: BankSettings | None,
+    field: nn.Module | None,
+    renderer: str | DepthRenderer,
+    device: torch.device | str | None,
+    progress: bool | Callable[[str, int, int], object],
+) -> ViewMatcher:
+    """The matcher of a mesh or a bank, or a given one; see :class:`Registrar`."""
+    if isinstance(source, ViewMatcher):
+        if any(value is not None for value in (pipeline, field, views, settings)):
+            raise InvalidInputError(
+                "Registrar: pipeline, field, views and settings belong to the matcher"
+            )
+        return source
+    if not isinstance(source, ViewBank):
+        pipeline = pipeline or Pipeline()
+        pipeline = replace(pipeline, bank=settings or pipeline.bank)
+        source = cached_bank(
+            source,
+            views,
+            pipeline=pipeline,
+            renderer=renderer,
+            device=device or "cpu",
+            progress=progress,
+        )
+    elif views is not None or settings is not None:
+        raise InvalidInputError(
+            "Registrar: views and settings belong to the bank; give them with a mesh only"
+        )
+    bank = source if device is None else source.to(device)
+    return ViewMatcher(bank, pipeline=pipeline, field=field, renderer=renderer)
 
 
 def _register_by_workers(

@@ -1,7 +1,7 @@
 """One pose from several photographs: each is registered alone, then candidates are compared in all
 of them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -178,34 +178,24 @@ def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> 
     if len(total) == 1 and len(rig.photographs) > 1:
         features["margin"] = MAX_MARGIN
     probabilities = first.result.probabilities
-    if is_calibrated(target.pipeline) and len(rig.photographs) + len(lost) > 1:
-        if len(rig.photographs) > 1:
-            found_in = [p.result.detection for p in every.photographs]
-            scores = [detection.score for detection in found_in if detection is not None] or [1.0]
-            any_right = max(scores) * probability_of_any(features, exact=rig.exact)
-            probabilities = hypothesis_probabilities(any_right, total, exact=rig.exact)
-        odds = probabilities[0] / max(1.0 - probabilities[0], 1e-9)
-        for p in every.photographs:  # those that were left out, and are confident of another pose
-            if p.index in lost and rig.angles(p.poses[:1], answer.T[:1]) > RIVAL_ANGLE:
-                other = p.result.confidence or 0.0
-                odds *= min(1.0, (1.0 - other) / max(other, 1e-9))
-        factor = odds / (1.0 + odds) / max(probabilities[0], 1e-9)
-        probabilities = tuple(factor * probability for probability in probabilities)
+    if is_calibrated(target.pipeline) and len(every.photographs) > 1:
+        probabilities = _joint_probabilities(rig, every, answer, total, features)
     margins = weights * (
         answer.scores[:, 0] - answer.scores[:, 1] if len(total) > 1 else MAX_MARGIN
     )
     contributions = dict(zip([p.index for p in rig.photographs], margins.tolist(), strict=True))
     views = []
     for i, camera in enumerate(cameras):
+        one = found[i]
+        measured = compared.get(i, {})
         view = PhotographPose(
-            camera @ answer.T[0], failure=reasons.get(i), contribution=contributions.get(i, 0.0)
+            camera @ answer.T[0],
+            box=one.photograph.box if isinstance(one, RigPhotograph) else None,
+            edge_support=measured.get("edge_support"),
+            similarity=measured.get("similarity"),
+            contribution=contributions.get(i, 0.0),
+            failure=reasons.get(i),
         )
-        if isinstance(one := found[i], RigPhotograph):
-            similarity = compared[i]["similarity"]
-            support = compared[i]["edge_support"]
-            view = replace(
-                view, box=one.photograph.box, similarity=similarity, edge_support=support
-            )
         views.append(view)
     return Registration(
         hypotheses=tuple(rig.hypothesis(answer, m, mean) for m in range(min(count, len(total)))),
@@ -219,6 +209,28 @@ def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> 
         views=tuple(views),
         reliable_from=target.pipeline.fit.reliable,
     )
+
+
+def _joint_probabilities(
+    rig: Rig, every: Rig, answer: Answer, total: Tensor, features: Mapping[str, float | None]
+) -> tuple[float, ...]:
+    """Probabilities of the poses with the sums ``total`` (M,) of scores in a ``rig``, which has
+    ``every`` photograph but those that do not show the best pose: where these are confident of
+    another one, that speaks against it."""
+    probabilities = rig.photographs[0].result.probabilities
+    if len(rig.photographs) > 1:
+        found_in = [p.result.detection for p in every.photographs]
+        scores = [detection.score for detection in found_in if detection is not None] or [1.0]
+        any_right = max(scores) * probability_of_any(features, exact=rig.exact)
+        probabilities = hypothesis_probabilities(any_right, total, exact=rig.exact)
+    odds = probabilities[0] / max(1.0 - probabilities[0], 1e-9)
+    counted = {p.index for p in rig.photographs}
+    for p in every.photographs:
+        if p.index not in counted and rig.angles(p.poses[:1], answer.T[:1]) > RIVAL_ANGLE:
+            other = p.result.confidence or 0.0
+            odds *= min(1.0, (1.0 - other) / max(other, 1e-9))
+    factor = odds / (1.0 + odds) / max(probabilities[0], 1e-9)
+    return tuple(factor * probability for probability in probabilities)
 
 
 def _evidence_of_best(rig: Rig, answer: Answer) -> dict[int, dict[str, float]]:
