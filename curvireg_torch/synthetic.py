@@ -164,28 +164,11 @@ def synthesize_photograph(
     # the object's rows and columns, and one more on each side for the differences
     high = slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2)
     wide = slice(max(int(columns[0]) - 1, 0), int(columns[-1]) + 2)
-    depth = depth[high, wide]
     v, u = torch.meshgrid(torch.arange(2.0 * H)[high], torch.arange(2.0 * W)[wide], indexing="ij")
-    points = depth[..., None] * (
-        torch.stack([u, v, torch.ones_like(u)], dim=-1).double() @ torch.linalg.inv(K).T
-    )
-    # Normals come from neighbouring points; at occluding contours they point to the camera.
-    dv, du = torch.gradient(points, dim=(0, 1))
-    normal = F.normalize(torch.linalg.cross(dv, du), dim=-1)
-    border = torch.maximum(du[..., 2].abs(), dv[..., 2].abs()) > 0.2 * mesh.scale
-    normal[border] = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
-    light = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
-    # from above, in front
-    light = F.normalize(light + torch.tensor([0.0, -0.8, -1.2], dtype=torch.float64), dim=0)
-    shade = 0.35 + 0.65 * (normal @ light).clamp(min=0)
-    model = (points - T_cam_from_model[:3, 3]) @ T_cam_from_model[:3, :3] / (0.5 * mesh.scale)
-    waves = torch.randn(3, 4, generator=generator, dtype=torch.float64) * 6
-    pattern = torch.sin(
-        model @ waves + 6.3 * torch.rand(4, generator=generator, dtype=torch.float64)
-    ).mean(dim=-1)
-    colour = 0.3 + 0.6 * torch.rand(3, generator=generator, dtype=torch.float64)
+    rays = torch.stack([u, v, torch.ones_like(u)], dim=-1).double() @ torch.linalg.inv(K).T
+    points = depth[high, wide, None] * rays
     surface = torch.zeros(2 * H, 2 * W, 3, dtype=torch.float64)
-    surface[high, wide] = shade[..., None] * colour * (1.0 + texture * pattern[..., None])
+    surface[high, wide] = _shades(mesh, T_cam_from_model, points, generator, texture)
     coverage = F.avg_pool2d(mask[None, None].float(), 2)[0]
     front = F.avg_pool2d((surface * mask[..., None]).permute(2, 0, 1)[None].float(), 2)[0]
     if has_colours(mesh):  # drawn before white
@@ -201,6 +184,28 @@ def synthesize_photograph(
         [int(columns[0]) - 0.5, int(rows[0]) - 0.5, int(columns[-1]) + 0.5, int(rows[-1]) + 0.5]
     )
     return image.clamp(0, 1), (box - 0.5) / 2.0
+
+
+def _shades(
+    mesh: trimesh.Trimesh, T: Tensor, points: Tensor, generator: torch.Generator, texture: float
+) -> Tensor:
+    """(H, W, 3) colours of the mesh at neighbouring ``points`` (H, W, 3) in the camera, under
+    random light."""
+    # Normals come from neighbouring points; at occluding contours they point to the camera.
+    dv, du = torch.gradient(points, dim=(0, 1))
+    normal = F.normalize(torch.linalg.cross(dv, du), dim=-1)
+    border = torch.maximum(du[..., 2].abs(), dv[..., 2].abs()) > 0.2 * mesh.scale
+    normal[border] = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
+    light = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+    # from above, in front
+    light = F.normalize(light + torch.tensor([0.0, -0.8, -1.2], dtype=torch.float64), dim=0)
+    shade = 0.35 + 0.65 * (normal @ light).clamp(min=0)
+    model = (points - T[:3, 3]) @ T[:3, :3] / (0.5 * mesh.scale)
+    waves = torch.randn(3, 4, generator=generator, dtype=torch.float64) * 6
+    phases = 6.3 * torch.rand(4, generator=generator, dtype=torch.float64)
+    pattern = torch.sin(model @ waves + phases).mean(dim=-1)
+    colour = 0.3 + 0.6 * torch.rand(3, generator=generator, dtype=torch.float64)
+    return shade[..., None] * colour * (1.0 + texture * pattern[..., None])
 
 
 class DemoScene(NamedTuple):

@@ -3,9 +3,10 @@
 import gc
 import json
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
-from itertools import groupby
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -94,32 +95,27 @@ def run_entries(
     common = json.dumps([dict(settings), results_digest()], sort_keys=True)
     digest_of_mesh = cache(partial(mesh_digest, textures=textures))
 
-    def request_of(entry: Entry) -> str:
+    def task_of(entry: Entry) -> Task:
         meshes = [(path.name, digest_of_mesh(path)) for path in entry.meshes]
-        return text_digest(json.dumps([common, entry.request(), meshes]))
+        return Task(entry, text_digest(json.dumps([common, entry.request(), meshes])))
 
-    order = {
-        meshes: place
-        for place, meshes in enumerate(dict.fromkeys(entry.meshes for entry in entries))
-    }
-    in_order = sorted(entries, key=lambda entry: order[entry.meshes])
+    of_meshes = defaultdict[tuple[Path, ...], list[Entry]](list)
+    for entry in entries:
+        of_meshes[entry.meshes].append(entry)
     device = torch.device(settings.get("device") or "cpu").type
     size = share_of_worker(len(entries), workers.count, device)
     with tqdm(desc=label, unit="photo", total=len(entries), disable=not progress) as bar:
 
+        def is_pending(task: Task) -> bool:
+            photo = partial(photo_digest, task.entry)
+            known = store.is_current(task.entry.key, task.request, photo)
+            bar.update(known)
+            return not known
+
         def blocks() -> Iterator[list[Task]]:
-            for _, same in groupby(in_order, key=lambda entry: entry.meshes):
-                block: list[Task] = []
-                for entry in same:
-                    request = request_of(entry)
-                    if store.is_current(entry.key, request, partial(photo_digest, entry)):
-                        bar.update()
-                        continue
-                    block.append(Task(entry, request))
-                    if len(block) == size:
-                        yield block
-                        block = []
-                if block:
+            for same in of_meshes.values():
+                pending = filter(is_pending, map(task_of, same))
+                while block := list(islice(pending, size)):
                     yield block
 
         state = _OpenedRegistrar(open_registrar, results_digest())

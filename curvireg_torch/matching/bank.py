@@ -211,11 +211,9 @@ class ViewBank:
         """
         mesh = as_mesh(mesh)
         pipeline = pipeline or Pipeline()
-        options: dict[str, Any] = {"image_size": image_size, "camera": camera}
-        pipeline = replace(
-            pipeline,
-            bank=replace(pipeline.bank, **{k: v for k, v in options.items() if v is not None}),
-        )
+        given = {"image_size": image_size, "camera": camera}
+        changed: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
+        pipeline = replace(pipeline, bank=replace(pipeline.bank, **changed))
         if views is None:
             views = views_of(mesh, pipeline.views)
         elif len(views) == 0:

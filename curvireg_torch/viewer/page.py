@@ -1,7 +1,8 @@
 """The page: the photograph, and beside it three steps, the answers and the inputs."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from nicegui import ui
@@ -86,50 +87,37 @@ class Steps:
         self.facts = dict[str, Any]()
         self.messages = dict[str, Any]()
         with region("ol", "steps"):
-            for number, name in enumerate(("photograph", "mesh", "box"), start=1):
-                with region("li", "step", data_testid=f"step-{name}") as self.cards[name]:
-                    text("h2", name.capitalize(), data_number=str(number))
-                    self.facts[name] = text("p", "", "facts", data_testid=f"{name}-facts")
-                    if name == "box":
-                        self.no_box = button(
-                            "Remove the box",
-                            lambda: self.session.shot.set_box(None),
-                            "no-box",
-                            "quiet",
-                        )
-                    else:
-                        file_chooser("Choose files", f"upload-{name}")
-                        self.messages[name] = self._message(name)
-                    if name == "photograph":
-                        self.facts["rig"] = text("p", "", "facts", data_testid="rig-facts")
-                        self.messages["rig"] = self._message("rig")
-                        with region("div", "row below"):
-                            self.no_photo = button(
-                                "Remove it", workspace.remove_photo, "no-photo", "quiet"
-                            )
-                            self.restore = button(
-                                "Bring it back", workspace.restore_photo, "restore-photo", "quiet"
-                            )
-                            self.no_rig = button(
-                                "Without the rig",
-                                lambda: workspace.open_rig(None),
-                                "no-rig",
-                                "quiet",
-                            )
-                    if name == "mesh":
-                        self.use_mm = button(
-                            "Use mm",
-                            lambda: workspace.set_option("unit", "mm"),
-                            "use-mm",
-                            "quiet below",
-                        )
-                        self.facts["advice"] = text("p", "", "facts", data_testid="mesh-advice")
-                        self.examine = button(
-                            "Look all the same",
-                            workspace.examination.start_patiently,
-                            "examine",
-                            "quiet below",
-                        )
+            with self._step(1, "photograph"):
+                self._ask_for("photograph")
+                self.facts["rig"] = text("p", "", "facts", data_testid="rig-facts")
+                self.messages["rig"] = self._message("rig")
+                with region("div", "row below"):
+                    self.no_photo = button("Remove it", workspace.remove_photo, "no-photo", "quiet")
+                    self.restore = button(
+                        "Bring it back", workspace.restore_photo, "restore-photo", "quiet"
+                    )
+                    self.no_rig = button(
+                        "Without the rig", lambda: workspace.open_rig(None), "no-rig", "quiet"
+                    )
+            with self._step(2, "mesh"):
+                self._ask_for("mesh")
+                self.use_mm = button(
+                    "Use mm",
+                    lambda: workspace.set_option("unit", "mm"),
+                    "use-mm",
+                    "quiet below",
+                )
+                self.facts["advice"] = text("p", "", "facts", data_testid="mesh-advice")
+                self.examine = button(
+                    "Look all the same",
+                    workspace.examination.start_patiently,
+                    "examine",
+                    "quiet below",
+                )
+            with self._step(3, "box"):
+                self.no_box = button(
+                    "Remove the box", lambda: self.session.shot.set_box(None), "no-box", "quiet"
+                )
         self.messages["file"] = self._message("file")
         with region("div", "go"):
             self.find = button("Find the pose", self._find, "register", "primary")
@@ -140,6 +128,18 @@ class Steps:
             self.stage = text("p", "", "stage", data_testid="progress", role="status")
             self.seconds = text("p", "", "stage", data_testid="seconds")
         self.messages |= {part: self._message(part) for part in ("pose", "page")}
+
+    @contextmanager
+    def _step(self, number: int, name: str) -> Iterator[None]:
+        """The card of a step, with what is known about it."""
+        with region("li", "step", data_testid=f"step-{name}") as self.cards[name]:
+            text("h2", name.capitalize(), data_number=str(number))
+            self.facts[name] = text("p", "", "facts", data_testid=f"{name}-facts")
+            yield
+
+    def _ask_for(self, name: str) -> None:
+        file_chooser("Choose files", f"upload-{name}")
+        self.messages[name] = self._message(name)
 
     def _message(self, part: str) -> Any:
         return text("p", "", "message", data_testid=f"message-{part}", role="alert")

@@ -151,12 +151,8 @@ class Answers:
 
     def _describe(self) -> None:
         document = self.session.document()
-        shot = self.session.shot
         result = self.session.shot.require_result()
         answer = result.answer
-        pose = result.answer.pose
-        if shot.view is not None:
-            pose = replace(pose, rotation=shot.projection[0][:3, :3])
         word = "by hand" if answer.edits else document["verdict"]
         word = "your choice" if answer.number and not answer.edits else word
         set_text(self.word, word)
@@ -170,6 +166,19 @@ class Answers:
         set_text(
             self.certainty, "" if confidence is None else f"confidence {two_decimals(confidence)}"
         )
+        set_text(self.facts, "\n".join(self._lines(document)))
+        self.repairs.clear()
+        with self.repairs:
+            for label, repair in self._repairs(document).items():
+                button(label, repair, label.lower().replace(" ", "-"))
+
+    def _lines(self, document: Mapping[str, Any]) -> list[str]:
+        """What is said of the answer's pose."""
+        shot = self.session.shot
+        result = shot.require_result()
+        pose = result.answer.pose
+        if shot.view is not None:
+            pose = replace(pose, rotation=shot.projection[0][:3, :3])
         mesh = result.registrar.bank.mesh
         front = (self.session.options.limits or {}).get("front")
         lines = [pose_in_words(pose.rotation, up=mesh_up(mesh), front=front)]
@@ -194,12 +203,7 @@ class Answers:
                 for view in document["photographs"]
             ]
             lines += [f"{name}: {words}" for name, words in told if words]
-        lines += [*document["warnings"], *remarks(document), *answer.edits]
-        set_text(self.facts, "\n".join(lines))
-        self.repairs.clear()
-        with self.repairs:
-            for label, repair in self._repairs(document).items():
-                button(label, repair, label.lower().replace(" ", "-"))
+        return [*lines, *document["warnings"], *remarks(document), *result.answer.edits]
 
     def _repairs(self, document: Mapping[str, Any]) -> dict[str, Callable[[], None]]:
         """What one click can do about what the page says of the answer."""

@@ -74,53 +74,56 @@ class Stage:
                 self.strip = region(
                     "div", "strip", role="group", aria_label="photographs", data_testid="strip"
                 )
-                with region(
-                    "div", "toolbar", role="toolbar", aria_label="photograph, box and pose"
-                ):
-                    self.modes = {
-                        mode: button(
-                            mode.capitalize(),
-                            lambda mode=mode: self._set_mode(mode),
-                            f"mode-{mode}",
-                            "quiet",
-                        )
-                        for mode in HELP
-                    }
-                    self.undo = button(
-                        "Undo", self._undo, "undo", "quiet", title="Ctrl+Z; once more repeats it"
-                    )
-                    self.fit = button("Fit the contours", self._fit, "fit", "quiet")
-                    for name, (symbol, label) in ZOOMS.items():
-                        zoom = {"type": "button", "data_zoom": name, "aria_label": label}
-                        text("button", symbol, "button quiet", title=label, **zoom)
-                    self.hint = text("p", "", "facts", data_testid="hint")
-                    self.touch_hint = text("p", "", "touch", data_testid="touch-hint")
+                self._lay_out_toolbar()
                 with (
                     region("div", "viewport", tabindex="0", role="application") as self.viewport,
                     region("div", "canvas", data_testid="photograph") as self.canvas,
                 ):
                     self.photo = region("img", alt="the photograph", draggable="false")
-                    self.solid, self.lines = (
-                        region("img", alt="", draggable="false") for _ in range(2)
-                    )
+                    self.solid = region("img", alt="", draggable="false")
+                    self.lines = region("img", alt="", draggable="false")
                     self.shapes = ui.html("", sanitize=False).classes("shapes")
-                with region("div", "layers") as self.layers:
-                    with region("label"):
-                        text("span", "Mesh")
-                        slider = {"type": "range", "min": "0", "max": "100", "value": "35"}
-                        region("input", data_testid="mesh", data_property="--mesh", **slider)
-                    with region("label"):
-                        contours = region(
-                            "input", type="checkbox", data_testid="contours", checked="checked"
-                        )
-                        text("span", "Contours")
-                    contours.on(
-                        "change",
-                        lambda e: self.lines.set_visibility(bool(e.args)),
-                        js_handler="(event) => emit(event.target.checked)",
-                    )
-                    text("p", LEGEND, "facts")
+                self._lay_out_layers()
         ui.on("stage", self._handle)
+
+    def _lay_out_toolbar(self) -> None:
+        with region("div", "toolbar", role="toolbar", aria_label="photograph, box and pose"):
+            self.modes = {
+                mode: button(
+                    mode.capitalize(),
+                    lambda mode=mode: self._set_mode(mode),
+                    f"mode-{mode}",
+                    "quiet",
+                )
+                for mode in HELP
+            }
+            self.undo = button(
+                "Undo", self._undo, "undo", "quiet", title="Ctrl+Z; once more repeats it"
+            )
+            self.fit = button("Fit the contours", self._fit, "fit", "quiet")
+            for name, (symbol, label) in ZOOMS.items():
+                zoom = {"type": "button", "data_zoom": name, "aria_label": label}
+                text("button", symbol, "button quiet", title=label, **zoom)
+            self.hint = text("p", "", "facts", data_testid="hint")
+            self.touch_hint = text("p", "", "touch", data_testid="touch-hint")
+
+    def _lay_out_layers(self) -> None:
+        with region("div", "layers") as self.layers:
+            with region("label"):
+                text("span", "Mesh")
+                slider = {"type": "range", "min": "0", "max": "100", "value": "35"}
+                region("input", data_testid="mesh", data_property="--mesh", **slider)
+            with region("label"):
+                contours = region(
+                    "input", type="checkbox", data_testid="contours", checked="checked"
+                )
+                text("span", "Contours")
+            contours.on(
+                "change",
+                lambda e: self.lines.set_visibility(bool(e.args)),
+                js_handler="(event) => emit(event.target.checked)",
+            )
+            text("p", LEGEND, "facts")
 
     def _set_mode(self, mode: str) -> None:
         self._commit()
