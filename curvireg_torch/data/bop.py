@@ -12,7 +12,7 @@ from ..errors import InvalidInputError, MissingFileError
 from ..formats.cameras.record import flattened
 from ..geometry.cameras import projected_boxes, transform
 from ..utils.checks import check_camera_matrix, check_rotation
-from ..utils.files import finite_numbers, read_json
+from ..utils.files import finite_numbers, read_json, without_zeros
 from ._base import (
     IMAGE_SUFFIXES,
     ObjectDataset,
@@ -141,7 +141,7 @@ class BOPDataset(ObjectDataset):
         for name in ("scene_gt.json", "scene_camera.json", "scene_gt_info.json"):
             try:
                 content = read_json(folder / name, dict, _README)
-                contents.append({_without_zeros(key): value for key, value in content.items()})
+                contents.append({without_zeros(key): value for key, value in content.items()})
             except MissingFileError:
                 if name != "scene_gt_info.json":
                     return self._skip("missing_annotation", f"{scene}/{name}")
@@ -278,10 +278,6 @@ def _images_by_number(scene: Path) -> dict[int, Path]:
             if path.suffix in IMAGE_SUFFIXES and path.stem.isdecimal():
                 found[int(path.stem)] = path
     return found
-
-
-def _without_zeros(key: str) -> str:
-    return str(int(key)) if key.isdecimal() and len(key) < 20 else key
 
 
 def _camera_pose(camera: dict[str, Any]) -> tuple[tuple[float, ...], ...]:

@@ -32,6 +32,7 @@ MAX_TOML_PARTS = 100
 _TOML = re.compile(r"(?:\s|#[^\n]*+\n)*+(?:\[[A-Za-z_][^\]\n]*+\]|\w++[ \t]*+=)")
 _COLMAP_LINE = re.compile(r"^\d+[ \t]+[A-Z][A-Z_]+[ \t]", re.MULTILINE)
 _YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_WORDS = {"": None, "~": None, "null": None, "true": True, "false": False}  # of YAML
 _COUNTS = (4, 9, 12, 16)  # numbers of fx, fy, cx, cy; of a matrix of 3 x 3, 3 x 4 and 4 x 4
 
 
@@ -90,16 +91,10 @@ def _numbers_alone(text: str) -> list[float]:
     words = re.sub(r"#.*|[\[\](),;]", " ", text[:5000]).split()
     if len(text) > 5000 or len(words) not in _COUNTS:
         return []
-    numbers = [number(word) for word in words]
-    return (
-        [value for value in numbers if isinstance(value, float)]
-        if not any(map(_is_text, numbers))
-        else []
-    )
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
+    try:
+        return list(map(float, words))
+    except ValueError:
+        return []
 
 
 def number(text: str) -> float | str:
@@ -131,13 +126,12 @@ def _arrays(data: bytes) -> dict[str, Any]:
         EOFError,
         MemoryError,
         KeyError,
+        RuntimeError,  # encrypted, or packed otherwise
         struct.error,
         zlib.error,
+        zipfile.BadZipFile,
     ) as error:
-        raise InvalidInputError("a damaged .npz or .npy; save it again") from error
-    # encrypted, or packed otherwise
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-        raise InvalidInputError("a damaged .npz; save it again with numpy.savez") from error
+        raise InvalidInputError("a damaged .npz or .npy; save it again with numpy.savez") from error
 
 
 def _array(data: bytes) -> Any:
@@ -145,12 +139,8 @@ def _array(data: bytes) -> Any:
     of objects."""
     stream = BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    reader = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, _, dtype = reader(stream)
+    headers = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
+    shape, _, dtype = headers[version != (1, 0)](stream)
     if dtype.kind not in "fiu":
         return None
     if int(np.prod(shape, dtype=object)) * dtype.itemsize > MAX_ARRAY_BYTES:
@@ -187,13 +177,11 @@ def _xml(text: str) -> Any:
             return numbers[0] if len(numbers) == 1 else numbers
         values: dict[str, Any] = {name: number(text) for name, text in element.attrib.items()}
         for child in element:
-            several = values.get(child.tag, [])
             inside = value(child)
-            values[child.tag] = (
-                [*(several if isinstance(several, list) else [several]), inside]
-                if several
-                else inside
-            )
+            several = values.get(child.tag)
+            if several:
+                inside = [*(several if isinstance(several, list) else [several]), inside]
+            values[child.tag] = inside
         return values or []
 
     root = ElementTree.fromstring(text)
@@ -204,9 +192,7 @@ def _yaml(text: str, expected: str) -> Any:
     """The first document with content. Tags say nothing here."""
     text = re.sub(r"(?m)^%.*", "", text)  # OpenCV's "%YAML:1.0" is none of YAML's directives
     try:
-        documents = (
-            _value(node, set(), MAX_DEPTH) for node in yaml.compose_all(text, _YAML_LOADER)
-        )
+        documents = (_value(node, set(), 0) for node in yaml.compose_all(text, _YAML_LOADER))
         return next((value for value in documents if value is not None), None)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -217,26 +203,16 @@ def _yaml(text: str, expected: str) -> Any:
 def _value(node: Any, known: set[int], depth: int) -> Any:
     """The value of a node of YAML. A node that is met again is an alias, and refused: those can
     blow a file up."""
-    if depth < 0:
+    if depth > MAX_DEPTH:
         raise InvalidInputError("nested too deeply; write it again")
     if id(node) in known:
         raise InvalidInputError("has aliases (*name), which are not read; write it without them")
     known.add(id(node))
     if isinstance(node, yaml.ScalarNode):
-        return _scalar(node)
+        is_quoted = node.style in ("'", '"')
+        return node.value if is_quoted else _WORDS.get(node.value.lower(), number(node.value))
     if isinstance(node, yaml.SequenceNode):
-        return [_value(item, known, depth - 1) for item in node.value]
-    values = {}
-    for key, item in node.value:
-        if not isinstance(key, yaml.ScalarNode):
-            raise InvalidInputError("a list or mapping where a key is expected; write it again")
-        values[str(key.value)] = _value(item, known, depth - 1)
-    return values
-
-
-def _scalar(node: Any) -> Any:
-    text = node.value
-    if node.style in ("'", '"'):
-        return text
-    known = {"": None, "~": None, "null": None, "true": True, "false": False}
-    return known.get(text.lower(), number(text))
+        return [_value(item, known, depth + 1) for item in node.value]
+    if not all(isinstance(key, yaml.ScalarNode) for key, _ in node.value):
+        raise InvalidInputError("a list or mapping where a key is expected; write it again")
+    return {str(key.value): _value(item, known, depth + 1) for key, item in node.value}

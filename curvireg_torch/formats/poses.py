@@ -7,22 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from trimesh.transformations import quaternion_matrix
 
 from ..errors import InvalidInputError, MissingFileError
+from ..utils.arrays import Floats
 from ..utils.files import check_table_size, finite_numbers, split_name
 from .cameras.record import flattened, plain
 from .documents import read_document
 
 _README = "docs/guides/known-pose.md"
-_MATRICES = {
-    plain(name)
-    for name in ("T_cam_from_model", "T_cam_from_object", "cam_from_model", "T_cam_obj", "T_co")
-}
-_MATRICES |= {
-    plain(name)
-    for name in ("T", "pose", "matrix", "transform", "transform_matrix", "ob_in_cam", "K")
-}
+_MATRIX_NAMES = """
+    T_cam_from_model T_cam_from_object cam_from_model T_cam_obj T_co T pose matrix transform
+    transform_matrix ob_in_cam K
+"""
+_MATRICES = set(map(plain, _MATRIX_NAMES.split()))
 # frames of ROS in which no camera looks along z: the world's, and bodies, whose x points forward
 _OTHER_FRAMES = re.compile(r"(^|/)(world|map|odom|base\w*|earth|\w*_link)$")
 FORMATS = (
@@ -42,7 +40,7 @@ class PoseRecord:
         confidence: of the pose, if the file has one.
     """
 
-    T: NDArray[np.float64]
+    T: Floats
     unit: str | None = None
     confidence: float | None = None
 
@@ -99,16 +97,10 @@ def _pose_of(content: Any, name: str, mesh: str) -> PoseRecord:
 
 def _named(content: Any, name: str, mesh: str) -> Any:
     """The part of a file with several poses that is meant."""
-    if isinstance(content, list) and all(isinstance(item, dict) for item in content) and content:
+    if isinstance(content, list) and content and all(isinstance(item, dict) for item in content):
         return _item(content, name, mesh)
-    if not isinstance(content, dict) or not any(
-        isinstance(value, list) for value in content.values()
-    ):
-        return content
-    images = {
-        key: value for key, value in content.items() if key.isdecimal() and isinstance(value, list)
-    }
-    if len(images) < len(content):
+    images = content if isinstance(content, dict) else {}
+    if not images or not all(k.isdecimal() and isinstance(v, list) for k, v in images.items()):
         return content
     image, _, index = name.partition(":")
     if not image and len(images) == 1:
@@ -126,32 +118,27 @@ def _item(items: Sequence[Any], name: str, mesh: str) -> Any:
     """The pose of a list with this label or index, or of the mesh's number; the only one without a
     name."""
     number = re.search(r"obj_(\d+)$", mesh)
-    labels = [str(item.get("label", "")) if isinstance(item, dict) else "" for item in items]
-    if name:
-        chosen = [item for item, label in zip(items, labels, strict=True) if label == name]
-        chosen = chosen or (
-            [items[int(name)]] if name.isdecimal() and int(name) < len(items) else []
-        )
+    fields = [item if isinstance(item, dict) else {} for item in items]
+    labels = [str(item.get("label", "")) for item in fields]
+    if name and name not in labels:
+        chosen = [int(name)] if name.isdecimal() and int(name) < len(items) else []
+    elif name:
+        chosen = [k for k, label in enumerate(labels) if label == name]
     elif len(items) > 1 and number:
-        chosen = [
-            item
-            for item in items
-            if isinstance(item, dict) and item.get("obj_id") == int(number[1])
-        ]
+        chosen = [k for k, item in enumerate(fields) if item.get("obj_id") == int(number[1])]
     else:
-        chosen = [
-            item for item, label in zip(items, labels, strict=True) if label and label == mesh
-        ] or list(items)
+        own = [k for k, label in enumerate(labels) if label and label == mesh]
+        chosen = own or [*range(len(items))]
     if len(chosen) != 1:
         names = ", ".join(label or str(index) for index, label in enumerate(labels[:8]))
         raise InvalidInputError(
             f"expected one pose, got {len(chosen)} of {len(items)}; choose one as FILE:NAME: "
             f"{names}"
         )
-    return chosen[0]
+    return items[chosen[0]]
 
 
-def _pose_matrix(numbers: Sequence[Any]) -> NDArray[np.float64]:
+def _pose_matrix(numbers: Sequence[Any]) -> Floats:
     """(4, 4) of 12 or 16 numbers row by row; or of 16 column by column, which have 0 0 0 1 in the
     last column and the translation in the last row."""
     last = [0.0, 0.0, 0.0, 1.0]
@@ -166,15 +153,15 @@ def _pose_matrix(numbers: Sequence[Any]) -> NDArray[np.float64]:
     return T
 
 
-def _numbers(values: Any, name: str, count: int) -> NDArray[np.float64]:
+def _numbers(values: Any, name: str, count: int) -> Floats:
     """``count`` finite numbers of nested lists."""
-    numbers = finite_numbers(_flat(values), count)
+    numbers = finite_numbers(flattened(values) if isinstance(values, list) else values, count)
     if numbers is None:
         raise InvalidInputError(f"{name}: expected {count} finite numbers, got {values!r:.80}")
     return np.array(numbers)
 
 
-def _transform(R: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
+def _transform(R: Floats, t: Floats) -> Floats:
     T = np.eye(4)
     T[:3, :3] = R.reshape(3, 3)
     T[:3, 3] = t
@@ -183,30 +170,23 @@ def _transform(R: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.flo
 
 def _rotation_and_translation(content: Mapping[str, Any]) -> PoseRecord:
     if content.get("frame") == "world":
-        message = (
+        raise InvalidInputError(
             "a result of several photographs, whose pose is in the world; give that in one "
             "camera, as in 'photographs'"
         )
-        raise InvalidInputError(message)
     if "rotation" in content and content.get("translation", ...) is None:
         raise InvalidInputError(
             "a result without a translation, as of a photograph without a camera; register with "
             "a camera first"
         )
-    rotation, translation = (
-        next((content[key] for key in keys if key in content), None)
-        for keys in (("rotation", "R"), ("translation", "t"))
-    )
+    rotation = content.get("rotation", content.get("R"))
+    translation = content.get("translation", content.get("t"))
     if rotation is None or translation is None:
         missing = "rotation of 3 x 3 numbers" if rotation is None else "translation"
         raise InvalidInputError(f"no {missing}; expected {FORMATS}")
     R = _numbers(rotation, "rotation", 9)
     t = _numbers(translation, "translation", 3)
     return PoseRecord(_transform(R, t), None, _confidence(content))
-
-
-def _flat(values: Any) -> Any:
-    return flattened(values) if isinstance(values, list) else values
 
 
 def _confidence(content: Mapping[str, Any]) -> float | None:
@@ -256,16 +236,14 @@ def _ros(content: Mapping[str, Any]) -> PoseRecord:
     return PoseRecord(_transform(_rotation(q, "orientation"), t), "m")
 
 
-def _rotation(quaternion: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+def _rotation(quaternion: Floats, name: str) -> Floats:
     """(3, 3) of x, y, z, w."""
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1.0) > 1e-2:
         raise InvalidInputError(
             f"{name}: expected a quaternion x, y, z, w of length 1, got {length:.3g}"
         )
-    x, y, z, w = quaternion / length
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + 2.0 * (w * cross + cross @ cross))
+    return np.asarray(quaternion_matrix(np.roll(quaternion, 1))[:3, :3])
 
 
 _READERS: dict[str, Callable[[Mapping[str, Any]], PoseRecord]] = {

@@ -244,6 +244,16 @@ def split_name(path: str | os.PathLike[str]) -> tuple[Path, str]:
     return file, text[len(str(file)) + 1 :]
 
 
+def without_zeros(name: str) -> str:
+    """A number without zeros in front; any other name as it is.
+
+    Example:
+        >>> without_zeros("000012"), without_zeros("a01")
+        ('12', 'a01')
+    """
+    return str(int(name)) if name.isdecimal() and len(name) < 20 else name
+
+
 def read_csv(path: Path) -> list[list[str]]:
     """The rows of a CSV file in UTF-8 that are not blank.
 

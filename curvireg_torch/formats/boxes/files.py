@@ -1,7 +1,7 @@
 """The boxes that a file lists, as they are written there."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 from ...errors import InvalidInputError
 from ...utils.files import check_table_size, finite_numbers, read_json
-from ..xml_files import check_xml
+from ..xml_files import read_xml
 
 README = "docs/formats.md"
 SUFFIXES = (".txt", ".json", ".xml")
@@ -139,23 +139,15 @@ def _around(numbers: Sequence[float]) -> Corners:
 
 
 def _json(content: Any) -> Iterator[ImageBox]:
-    for detect, read in _JSON_READERS:
-        if detect(content):
-            return read(content)
-    raise _refused("expected detections of COCO, or annotations of LabelMe")
-
-
-def _is_label_studio(content: Any) -> bool:
     first = content[0] if isinstance(content, list) and content else None
-    return isinstance(first, dict) and "data" in first and "bbox" not in first
-
-
-def _label_studio(_: Any) -> Iterator[ImageBox]:
-    raise InvalidInputError("Label Studio's own JSON; export it as COCO, or as YOLO")
-
-
-def _is_labelme(content: Any) -> bool:
-    return isinstance(content, dict) and isinstance(content.get("shapes"), list)
+    if isinstance(first, dict) and "data" in first and "bbox" not in first:
+        raise InvalidInputError("Label Studio's own JSON; export it as COCO, or as YOLO")
+    fields = content if isinstance(content, dict) else {"annotations": content}
+    if isinstance(fields.get("shapes"), list):
+        return _labelme(fields)
+    if isinstance(fields.get("annotations"), list):
+        return _coco(fields)
+    raise _refused("expected detections of COCO, or annotations of LabelMe")
 
 
 def _labelme(content: Mapping[str, Any]) -> Iterator[ImageBox]:
@@ -179,28 +171,16 @@ def _numbers_of_points(points: Any) -> Sequence[float]:
     """x, y, x, y, ... of a list of points; none of anything else."""
     if not isinstance(points, list):
         return ()
-    numbers: list[float] = []
-    for point in points:
-        numbers += finite_numbers(point, 2) or (math.nan,)
-    return () if any(map(math.isnan, numbers)) else numbers
+    pairs = [finite_numbers(point, 2) for point in points]
+    return () if None in pairs else [number for pair in pairs for number in pair or ()]
 
 
-def _is_coco(content: Any) -> bool:
-    items = content.get("annotations") if isinstance(content, dict) else content
-    return isinstance(items, list)
-
-
-def _coco(content: Any) -> Iterator[ImageBox]:
+def _coco(content: Mapping[str, Any]) -> Iterator[ImageBox]:
     """Of COCO x, y, width, height from the picture's edge; of MegaPose ``bbox_modal``, corners from
     the centre of the first pixel."""
-    items = content
-    images: Mapping[str, Mapping[str, Any]] = {}
-    categories: Mapping[str, Mapping[str, Any]] = {}
-    if isinstance(content, dict):
-        items = content["annotations"]
-        images = _by_id(content.get("images"))
-        categories = _by_id(content.get("categories"))
-    for index, item in enumerate(items):
+    images = _by_id(content.get("images"))
+    categories = _by_id(content.get("categories"))
+    for index, item in enumerate(content["annotations"]):
         fields = item if isinstance(item, dict) else {}
         is_corners = "bbox" not in fields
         numbers = finite_numbers(fields.get("bbox_modal" if is_corners else "bbox"), 4)
@@ -209,12 +189,7 @@ def _coco(content: Any) -> Iterator[ImageBox]:
         x, y, c, d = numbers
         corners = (x, y, x + c, y + d)
         if is_corners:
-            corners = (
-                x + PIXEL_CENTRE,
-                y + PIXEL_CENTRE,
-                c + PIXEL_CENTRE,
-                d + PIXEL_CENTRE,
-            )
+            corners = (x + PIXEL_CENTRE, y + PIXEL_CENTRE, c + PIXEL_CENTRE, d + PIXEL_CENTRE)
         score = finite_numbers([fields.get("score", 1.0)], 1) or (0.0,)
         category = str(fields.get("category_id", ""))
         name = str(categories.get(category, {}).get("name", ""))
@@ -242,23 +217,14 @@ def _size(height: Any, width: Any) -> tuple[int, int] | None:
     return int(sides[0]), int(sides[1])
 
 
-_JSON_READERS: tuple[tuple[Callable[[Any], bool], Callable[[Any], Iterator[ImageBox]]], ...] = (
-    (_is_label_studio, _label_studio),
-    (_is_labelme, _labelme),
-    (_is_coco, _coco),
-)
-
-
 # ---- XML: Pascal VOC ----------------------------------------------------------------------------
 
 
 def _xml(file: Path) -> Iterator[ImageBox]:
     check_table_size(file)
-    data = file.read_bytes()
     try:
-        check_xml(data)
-        root = ElementTree.fromstring(data)
-    except (ValueError, ElementTree.ParseError, LookupError) as error:
+        root = read_xml(file.read_bytes())
+    except ValueError as error:
         raise InvalidInputError(f"damaged, or no XML that is read ({error})") from error
     if root.tag == "annotations":
         raise InvalidInputError("CVAT's own XML; export it as COCO 1.0, YOLO, or PASCAL VOC")

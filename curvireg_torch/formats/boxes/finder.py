@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from ...errors import CurviregWarning, InvalidInputError, MissingFileError
 from ...utils.choices import BOX_FORMATS
-from ...utils.files import split_name
+from ...utils.files import split_name, without_zeros
 from .files import (
     ANY_FOLDER,
     ID_LABEL,
@@ -60,7 +60,7 @@ def pixel_box(
     if size is None:
         raise InvalidInputError(f"box: {box_format} of a photograph, not of a video; give px")
     if box_format == "yolo":
-        return _of_fractions((a - c / 2, b - d / 2, a + c / 2, b + d / 2), size)
+        a, b, c, d = a - c / 2, b - d / 2, a + c / 2, b + d / 2
     return _of_fractions((a, b, c, d), size)
 
 
@@ -202,7 +202,7 @@ class BoxFile:
         names: dict[str, list[str]] = {}
         for image in self._images:
             last = PurePosixPath(_posix(image)).name
-            for name in dict.fromkeys((last, _stem(last), _without_zeros(_stem(last)))):
+            for name in dict.fromkeys((last, _stem(last), without_zeros(_stem(last)))):
                 names.setdefault(name, []).append(image)
         return names
 
@@ -221,26 +221,24 @@ class BoxFile:
     def _image(self, photo: Path) -> tuple[str, bool]:
         """The image of a file that is a photograph, and whether one of its folders says so."""
         around = _folders(os.path.abspath(photo))
-        for name in (photo.name, photo.stem, _without_zeros(photo.stem)):
-            matches = {
+        for name in (photo.name, photo.stem, without_zeros(photo.stem)):
+            counts = {
                 image: _matching(_folders(image), around) for image in self._names.get(name, [])
             }
             matches = {
                 image: count
-                for image, count in matches.items()
+                for image, count in counts.items()
                 if count >= self._distinguishing_folders(image)
             }
-            if not matches:
-                continue
-            most = max(matches.values())
+            most = max(matches.values(), default=0)
             chosen = [image for image, count in matches.items() if count == most]
             if len(chosen) > 1:
                 names = " and ".join(chosen[:3])
                 raise InvalidInputError(
                     f"{self.path}: {names} may both be this photograph; name their folders"
                 )
-            (image,) = chosen
-            return image, most > 0
+            if chosen:
+                return chosen[0], most > 0
         return "", False
 
 
@@ -252,14 +250,10 @@ def _stem(name: str) -> str:
     return PurePosixPath(name).stem
 
 
-def _without_zeros(name: str) -> str:
-    return str(int(name)) if name.isdecimal() and len(name) < 20 else name
-
-
 def _folders(name: str) -> list[str]:
     """The folders of a path, numbers without zeros in front."""
     parts = PurePosixPath(_posix(name)).parts[:-1]
-    return [_without_zeros(part) for part in parts if part not in ("/", ".", "..")]
+    return [without_zeros(part) for part in parts if part not in ("/", ".", "..")]
 
 
 def _matching(folders: Sequence[str], around: Sequence[str]) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import MAX_CAMERA_BYTES, InvalidInputError, MissingFileError
-from ...utils.files import split_name
+from ...utils.files import split_name, without_zeros
 from ..documents import EXPECTED, read_document
 from .kinds import FORMATS, Format
 from .record import (
@@ -110,11 +110,7 @@ class _Found:
     @property
     def names(self) -> set[str]:
         """The whole path, and its parts; numbers without zeros in front."""
-        return {_without_zeros(part) for part in (*self.path, "/".join(self.path))}
-
-
-def _without_zeros(name: str) -> str:
-    return str(int(name)) if name.isdecimal() and len(name) < 20 else name
+        return {without_zeros(part) for part in (*self.path, "/".join(self.path))}
 
 
 class _Cameras:
@@ -155,7 +151,7 @@ class _Cameras:
         """The camera with a name, and the function that reads it."""
         if len(self.found) == 1 and name in self.found[0].format.others:
             return self.found[0], self.found[0].format.others[name]
-        named = self.by_name.get(_without_zeros(name), []) if name else self.found
+        named = self.by_name.get(without_zeros(name), []) if name else self.found
         if named and all(camera.values == named[0].values for camera in named):
             return named[0], named[0].format.parse
         last = [camera.path[-1] if camera.path else "" for camera in self.found]

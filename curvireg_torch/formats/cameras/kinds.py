@@ -151,8 +151,9 @@ def _matrix_rows(numbers: Sequence[float]) -> list[list[float]]:
         )
     width = 3 if count == 9 else 4
     rows = [list(numbers[start : start + width]) for start in range(0, count, width)]
-    beyond = [row[3] for row in rows[:3] if width == 4] + rows[3][:3] if count == 16 else []
-    beyond = [row[3] for row in rows] if count == 12 else beyond
+    beyond = [value for row in rows[:3] for value in row[3:]] + [
+        x for row in rows[3:] for x in row[:3]
+    ]
     if any(beyond):
         raise InvalidInputError(
             "camera matrix: expected 3 x 3 numbers, got a projection that also moves the camera"
@@ -219,10 +220,12 @@ def _model_of(text: str) -> str:
     """OpenCV's model of another tool's name."""
     name = _plain_model(text)
     if name not in MODELS:
-        raise InvalidInputError(
-            f"camera model {text!r:.40} is not supported; choose from {KNOWN_MODELS}"
-        )
+        raise _unsupported(text)
     return MODELS[name]
+
+
+def _unsupported(name: object, known: str = KNOWN_MODELS) -> InvalidInputError:
+    return InvalidInputError(f"camera model {name!r:.40} is not supported; choose from {known}")
 
 
 def _read_distortion(record: Record, model: str | None) -> list[float]:
@@ -242,11 +245,7 @@ def _single_coefficients(record: Record, model: str | None) -> list[float]:
     tangential = record.numbers(*TANGENTIAL)
     if radial or tangential:
         if model == FISHEYE:
-            return (
-                [*radial, *tangential]
-                if not any(tangential) and len(radial) == 4
-                else [*radial, *tangential, 0.0]
-            )
+            return [*radial, *tangential, *([] if len(radial) == 4 else [0.0])]
         first = [*radial, 0.0, 0.0][:2]
         rest = radial[2:]
         return padded([*first, *(tangential or (0.0, 0.0)), *rest])
@@ -309,20 +308,9 @@ def _plain_camera(record: Record) -> CameraRecord:
 
 
 def _is_plain(record: Record) -> bool:
-    counts = [
-        len(flattened(value)) for key, value in record.values.items() if plain(key) in _PLAIN_MATRIX
-    ]
-    pairs = [
-        len(flattened(value)) == 2
-        for key, value in record.values.items()
-        if plain(key) in _PLAIN_PAIRS
-    ]
     has_one_focal = record.has(ONE_FOCAL) and record.has(*CENTRE[0])
-    return any(counts) or record.has(*FOCAL[0]) or has_one_focal or sum(pairs) == 2
-
-
-_PLAIN_MATRIX = {plain(name) for name in MATRIX}
-_PLAIN_PAIRS = {plain(name) for names in PAIRS for name in names}
+    has_pairs = record.lengths(*PAIRS[0], *PAIRS[1]).count(2) == 2
+    return any(record.lengths(*MATRIX)) or record.has(*FOCAL[0]) or has_one_focal or has_pairs
 
 
 def _unknown_order(record: Record) -> CameraRecord:
@@ -334,23 +322,14 @@ def _unknown_order(record: Record) -> CameraRecord:
     cx, cy = (row[2] for row in camera.matrix[:2])
 
     def distance(size: tuple[int, int]) -> float:
-        H, W = size
-        return abs(cx / W - 0.5) + abs(cy / H - 0.5)
+        return abs(cx / size[1] - 0.5) + abs(cy / size[0] - 0.5)
 
-    first, second = camera.size
-    return replace(camera, size=min((camera.size, (second, first)), key=distance))
+    return replace(camera, size=min(camera.size, camera.size[::-1], key=distance))
 
 
 def _has_pair_of_sides(record: Record) -> bool:
-    sides = [value for key, value in record.values.items() if plain(key) in _PLAIN_SIZES]
-    matrices = [
-        len(flattened(value)) for key, value in record.values.items() if plain(key) in _PLAIN_MATRIX
-    ]
-    has_matrix = 9 in matrices or record.has(*FOCAL[0])
-    return has_matrix and any(isinstance(side, list) for side in sides)
-
-
-_PLAIN_SIZES = {plain(name) for name in SIZES}
+    has_matrix = 9 in record.lengths(*MATRIX) or record.has(*FOCAL[0])
+    return has_matrix and isinstance(record.get(*SIZES), list)
 
 
 def _is_matlab(record: Record) -> bool:
@@ -371,8 +350,7 @@ def _own_result(record: Record) -> CameraRecord:
     """The object "camera" of result.json: its size is height, width. A focal length that was
     estimated remains as uncertain as it was."""
     camera = _plain_camera(record)
-    if camera.size is not None:
-        camera = replace(camera, size=(camera.size[1], camera.size[0]))
+    camera = replace(camera, size=camera.size and camera.size[::-1])
     deviations = record.numbers("focal_deviation")
     if not deviations:
         return camera
@@ -390,9 +368,13 @@ def _ros_rectified(record: Record) -> CameraRecord:
     numbers = record.numbers("P", "projection_matrix")
     if len(numbers) != 12:
         raise InvalidInputError(f"projection matrix: expected 12 numbers, got {len(numbers)}")
-    _plain_camera(record)  # reads, and so checks, the rest
-    rows = [value for start in (0, 4, 8) for value in numbers[start : start + 3]]
-    return _region(record, _camera_from(rows, size=_checked_size(_read_size(record))))
+    size = _plain_camera(record).size  # reads, and so checks, the rest
+    return _region(record, _camera_from(_left_part(numbers), size=size))
+
+
+def _left_part(projection: Sequence[float]) -> list[float]:
+    """The left 3 x 3 of a projection matrix of 3 x 4, whose last column moves the camera."""
+    return [value for start in (0, 4, 8) for value in projection[start : start + 3]]
 
 
 def _region(record: Record, camera: CameraRecord) -> CameraRecord:
@@ -405,13 +387,12 @@ def _region(record: Record, camera: CameraRecord) -> CameraRecord:
     if (left, top, width, height, *steps) == (0.0, 0.0, 0.0, 0.0, 1.0, 1.0):
         return camera
     H, W = camera.size or (0, 0)
-    width = width or W - left
-    height = height or H - top
-    rows = []
-    for (a, b, c), step, offset in zip(camera.matrix, steps, (left, top), strict=False):
+    rows = [
         # a pixel covers the ``step`` ones from its first edge on
-        rows.append((a / step, b / step, (c + 0.5 - offset) / step - 0.5))
-    size = (int(height // steps[1]), int(width // steps[0]))
+        (a / step, b / step, (c + 0.5 - offset) / step - 0.5)
+        for (a, b, c), step, offset in zip(camera.matrix, steps, (left, top), strict=False)
+    ]
+    size = int((height or H - top) // steps[1]), int((width or W - left) // steps[0])
     matrix = (*rows, camera.matrix[2])
     return replace(camera, matrix=matrix, size=size if min(size) > 0 else None)
 
@@ -419,8 +400,6 @@ def _region(record: Record, camera: CameraRecord) -> CameraRecord:
 def _nerfstudio(record: Record) -> CameraRecord:
     """Of nerfstudio and instant-ngp: pixels count from the picture's corner, as COLMAP's."""
     model = _read_model(record)
-    width = record.number("w")
-    height = record.number("h")
     if (fx := record.number("fl_x")) is None:
         raise InvalidInputError("no fl_x; without it, give the field of view", kind="view")
     fy = record.number("fl_y") or fx
@@ -433,7 +412,7 @@ def _nerfstudio(record: Record) -> CameraRecord:
             "distortion: k4 of nerfstudio is not OpenCV's; calibrate without it"
         )
     distortion = _single_coefficients(record, model)
-    size = _checked_size([side for side in (width, height) if side is not None])
+    size = _checked_size(record.numbers("w") + record.numbers("h"))
     return _camera_from([fx, fy, cx - 0.5, cy - 0.5], distortion, model or RADIAL_TANGENTIAL, size)
 
 
@@ -448,9 +427,7 @@ def _opensfm(record: Record) -> CameraRecord:
     picture's centre."""
     name = record.get("projection_type")
     if name not in OPENSFM:
-        raise InvalidInputError(
-            f"camera model {name!r:.40} is not supported; choose from {', '.join(OPENSFM)}"
-        )
+        raise _unsupported(name, ", ".join(OPENSFM))
     size = _checked_size(record.numbers(*WIDTH) + record.numbers(*HEIGHT))
     fx = record.number("focal_x", "focal")
     if size is None or fx is None:
@@ -469,8 +446,7 @@ def _opensfm(record: Record) -> CameraRecord:
 def _kitti(record: Record) -> CameraRecord:
     """The left 3 x 3 of a projection matrix of KITTI, whose last column is the place of the camera
     beside the first one."""
-    numbers = record.numbers("kitti")
-    return _camera_from([value for start in (0, 4, 8) for value in numbers[start : start + 3]])
+    return _camera_from(_left_part(record.numbers("kitti")))
 
 
 # numbers of focal lengths and of coefficients, which are the first ones of OpenCV, and the model
@@ -547,7 +523,7 @@ def _kannala_brandt(record: Record) -> CameraRecord:
 
 def _mei(record: Record) -> CameraRecord:
     record.words(*MODEL_NAMES)
-    raise InvalidInputError(f"camera model 'MEI' is not supported; choose from {KNOWN_MODELS}")
+    raise _unsupported("MEI")
 
 
 UNREAD = {

@@ -66,8 +66,12 @@ class Record:
 
     def has(self, *names: str) -> bool:
         """Whether the dict itself has one of the keys."""
-        present = {plain(key) for key in self.values}
-        return any(plain(name) in present for name in names)
+        return not set(map(plain, names)).isdisjoint(map(plain, self.values))
+
+    def lengths(self, *names: str) -> list[int]:
+        """How many values each of the keys holds that the dict itself has."""
+        wanted = set(map(plain, names))
+        return [len(flattened(x)) for key, x in self.values.items() if plain(key) in wanted]
 
     def get(self, *names: str) -> Any:
         """The value of the first key that is one of the names; None without one."""
@@ -95,8 +99,7 @@ class Record:
 
     def words(self, *names: str) -> list[str]:
         """The texts of those of the keys that have one."""
-        texts = [self.get(name) for name in names]
-        return [text for text in texts if isinstance(text, str)]
+        return [text for name in names if isinstance(text := self.get(name), str)]
 
     def inside(self, *names: str) -> "Record | None":
         """The dict that is the value of one of the keys."""

@@ -3,7 +3,7 @@
 
 import tempfile
 import warnings
-import xml.etree.ElementTree as ET
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,14 @@ from ...errors import (
     MAX_CAD_MEMORY,
     MAX_CAD_SECONDS,
     MAX_MESH_BYTES,
-    MAX_MESH_FACES,
-    MAX_MESH_PARTS,
     MAX_TEXTURE_PIXELS,
 )
 from ...utils.choices import UNITS
 from ...utils.extras import check_extras
 from ...utils.programs import run_program
-from ..xml_files import check_elements, check_xml, local_name
+from ..xml_files import local_name, read_xml
 from .gltf import read_gltf
+from .limits import check_faces, check_parts
 from .scenes import joined_scene
 from .source import MeshSource, ReadMesh, spellings
 
@@ -41,7 +40,8 @@ _IGES_FLAGS = {b"1": "in", b"2": "mm", b"4": "ft", b"6": "m", b"10": "cm"}
 
 
 def bounded(source: MeshSource) -> bytes:
-    """The content of a file whose reader takes much more memory than the file."""
+    """The content of a file whose reader is optional, and takes much more memory than the file."""
+    check_extras([source.path])
     if source.path.stat().st_size > MAX_CAD_BYTES:
         raise ValueError(
             f"larger than {MAX_CAD_BYTES:,} bytes; export parts of it, or another format"
@@ -52,27 +52,23 @@ def bounded(source: MeshSource) -> bytes:
 def read_step(source: MeshSource) -> ReadMesh:
     """Read a STEP or IGES file: in its own unit where that is one of ``UNITS``, else in metres; z
     is up."""
-    suffix = source.path.suffix.lower()
-    check_extras([source.path])
     data = bounded(source)
-    is_iges = suffix in (".igs", ".iges")
+    is_iges = source.path.suffix.lower() in (".igs", ".iges")
     if not is_iges and not data.lstrip().startswith(b"ISO-10303-21"):
         raise ValueError("not a STEP file")
     unit = (iges_unit(data) if is_iges else step_unit(data)) or "m"
     mesh = read_gltf(source, _converted(source.path.resolve(), "iges" if is_iges else "step"))
     metres = IGES_METRES if is_iges else 1.0
-    vertices = mesh.vertices * (metres / UNITS[unit])
-    return ReadMesh(vertices, mesh.faces, mesh.colours, unit, "z")
+    return replace(mesh, vertices=mesh.vertices * (metres / UNITS[unit]), unit=unit, up="z")
 
 
 def _converted(path: Path, kind: str) -> bytes:
     """The GLB of a STEP file, in metres, or of an IGES file, in millimetres."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "part.glb")
-        tolerances = [str(LINEAR_TOLERANCE), str(ANGULAR_TOLERANCE)]
         has_ended_well = run_program(
             _PROGRAM,
-            [str(path), str(out), kind, *tolerances],
+            [str(path), str(out), kind, str(LINEAR_TOLERANCE), str(ANGULAR_TOLERANCE)],
             name="OpenCASCADE",
             seconds=MAX_CAD_SECONDS,
             memory=MAX_CAD_MEMORY,
@@ -175,14 +171,10 @@ class _Pictures(trimesh.resolvers.Resolver):  # type: ignore[misc]
 
 def read_collada(source: MeshSource) -> ReadMesh:
     """Read a Collada file in its own unit and axes."""
-    check_extras([source.path])
     data = bounded(source)
-    check_xml(data)
-    check_elements(data)
-    root = ET.fromstring(data)
+    root = read_xml(data)
     _check_copies(root)
     stated = {local_name(one): one for one in root.iter() if local_name(one) in ("unit", "up_axis")}
-    metres = float(stated["unit"].get("meter", "1")) if "unit" in stated else None
     axis = (stated["up_axis"].text or "").strip() if "up_axis" in stated else "Y_UP"
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -194,18 +186,13 @@ def read_collada(source: MeshSource) -> ReadMesh:
         if "texture" in str(warning.message) or "colours" in str(warning.message):
             source.warn("texture", str(warning.message))
     if mesh is None:
-        return ReadMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    vertices = np.asarray(mesh.vertices, np.float64)
-    unit = None
-    if metres is not None:
-        unit = next(
-            (name for name, length in UNITS.items() if abs(metres / length - 1.0) < 1e-6), None
-        )
-        if unit is None:
-            vertices = vertices * metres
-            unit = "m"
-    up = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}.get(axis)
-    return ReadMesh(vertices, np.asarray(mesh.faces, np.int64), colours, unit, up)
+        return ReadMesh.joined([])
+    found = ReadMesh(
+        np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), colours
+    )
+    if "unit" in stated:
+        found = found.in_unit_of(float(stated["unit"].get("meter", "1")))
+    return replace(found, up={"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}.get(axis))
 
 
 def _check_copies(root: Any) -> None:
@@ -242,10 +229,8 @@ def _check_copies(root: Any) -> None:
         parts = sum(one[0] for one in found)
         total = sum(one[1] for one in found)
         known[node] = parts, total
-        if parts > MAX_MESH_PARTS:
-            raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
-        if total > MAX_MESH_FACES:
-            raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
+        check_parts(parts)
+        check_faces(total)
         return known[node]
 
     count(root, 0)

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PIL.Image import Resampling
 
 from ...errors import MAX_IMAGE_PIXELS, MAX_TEXTURE_PIXELS
+from ...utils.arrays import Bytes, Floats, Singles
 from ...utils.pictures import PICTURE_STARTS, open_picture
 from ...utils.srgb import srgb
 
@@ -19,7 +20,7 @@ LARGE = 1 << 25  # Pixels of a texture that is reduced in its own mode first
 _UNSET = (102, 102, 102)  # trimesh's colour for a material without one
 _PLAIN = 255
 # by their ids, images, which so keep them, and pixels
-_Textures = dict[int, tuple[Any, NDArray[np.uint8] | None]]
+_Textures = dict[int, tuple[Any, Bytes | None]]
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,10 @@ class SurfaceColours:
         (12, (2, 3, 3))
     """
 
-    corners: NDArray[np.uint8]
-    uv: NDArray[np.float32]
+    corners: Bytes
+    uv: Singles
     texture: NDArray[np.int32]
-    textures: tuple[NDArray[np.uint8], ...] = ()
+    textures: tuple[Bytes, ...] = ()
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -88,6 +89,35 @@ class SurfaceColours:
         )
 
 
+class Painting:
+    """Colours of F faces in the making: white at first, without a texture.
+
+    Attributes:
+        corners: (F, 3, 3) uint8 RGB, which readers change.
+    """
+
+    def __init__(self, faces: int) -> None:
+        self.corners = np.full((faces, 3, 3), _PLAIN, np.uint8)
+        self._uv = np.zeros((faces, 3, 2), np.float32)
+        self._texture = np.full(faces, -1, np.int32)
+        self._textures: list[Bytes] = []
+
+    def add_texture(self, faces: Any, texture: Bytes, uv: Floats | Singles) -> None:
+        """Give ``faces``, an index, a texture at the coordinates (N, 3, 2) of their corners."""
+        self._uv[faces] = np.nan_to_num(uv, posinf=0.0, neginf=0.0)
+        self._texture[faces] = len(self._textures)
+        self._textures.append(texture)
+
+    def finished(self) -> SurfaceColours:
+        """The colours."""
+        return SurfaceColours(self.corners, self._uv, self._texture, tuple(self._textures))
+
+
+def byte_colours(fractions: Any) -> Bytes:
+    """Colours in [0, 1], beyond which they are clipped, as uint8."""
+    return np.asarray(np.round(255.0 * np.clip(fractions, 0.0, 1.0)), np.uint8)
+
+
 def colours_of_parts(meshes: Iterable[Any]) -> list[SurfaceColours | None]:
     """The colours of each mesh, plain ones too; None, with a warning, where they cannot be used. A
     texture is decoded once, however many meshes share it."""
@@ -96,8 +126,6 @@ def colours_of_parts(meshes: Iterable[Any]) -> list[SurfaceColours | None]:
     for mesh in meshes:
         try:
             colours = _surface_colours(mesh, known)
-            if colours is not None and len(colours) != len(mesh.faces):
-                raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
         except Exception as error:  # files may hold anything
             warnings.warn(
                 f"the mesh's colours cannot be used ({error}); it is drawn in grey", stacklevel=2
@@ -127,35 +155,35 @@ def _surface_colours(mesh: Any, known: _Textures) -> SurfaceColours | None:
         return colours
     visual = mesh.visual
     faces = np.asarray(mesh.faces)
-    plain = SurfaceColours.plain(len(faces))
+    painting = Painting(len(faces))
     if visual.kind == "face":
-        corners = np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None, :3], 3, axis=1)
-        return replace(plain, corners=corners)
+        painting.corners[:] = np.asarray(visual.face_colors, np.uint8)[:, None, :3]
+        return painting.finished()
     if visual.kind == "vertex":
-        return replace(plain, corners=np.asarray(visual.vertex_colors, np.uint8)[faces][..., :3])
+        painting.corners[:] = np.asarray(visual.vertex_colors, np.uint8)[faces][..., :3]
+        return painting.finished()
     if visual.kind != "texture":
         return None
     material = visual.material
     image = getattr(material, "image", None)  # beside an image, exporters of OBJ write any colour
     image = getattr(material, "baseColorTexture", None) if image is None else image
     factor = getattr(material, "baseColorFactor", None)
-    if factor is None:
-        colour = material.main_color[:3]
-    else:  # linear, as factors in glTF are
-        linear = np.asarray(factor[:3], np.float64) / 255
-        colour = np.asarray((255 * srgb(linear)).round(), np.uint8)
     texture = None if image is None or visual.uv is None else _decoded(image, known)
+    if factor is not None:  # linear, as factors in glTF are
+        painting.corners[:] = byte_colours(srgb(np.asarray(factor[:3], np.float64) / 255))
+    elif texture is None:
+        colour = tuple(material.main_color[:3])
+        if colour == _UNSET:
+            return None
+        painting.corners[:] = colour
     if texture is not None:
-        tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else colour)
-        uv = np.nan_to_num(np.asarray(visual.uv, np.float32), posinf=0.0, neginf=0.0)[faces][
-            ..., :2
-        ]
-        return SurfaceColours(tint.corners, uv, np.zeros(len(faces), np.int32), (texture,))
-    unset = factor is None and tuple(colour) == _UNSET
-    return None if unset else SurfaceColours.plain(len(faces), colour)
+        painting.add_texture(
+            slice(None), texture, np.asarray(visual.uv, np.float32)[faces][..., :2]
+        )
+    return painting.finished()
 
 
-def _decoded(image: Any, known: _Textures) -> NDArray[np.uint8] | None:
+def _decoded(image: Any, known: _Textures) -> Bytes | None:
     """(h, w, 3) uint8 of a PIL image, decoded once; None, with a warning, if it cannot be used."""
     if id(image) not in known:
         texture = None
@@ -170,7 +198,7 @@ def _decoded(image: Any, known: _Textures) -> NDArray[np.uint8] | None:
     return known[id(image)][1]
 
 
-def texture_pixels(content: bytes, most: int) -> tuple[NDArray[np.uint8], int]:
+def texture_pixels(content: bytes, most: int) -> tuple[Bytes, int]:
     """(h, w, 3) uint8 of a picture's file, reduced, and how many pixels it has: ``most`` at
     most."""
     with open_picture(content) as image:
@@ -180,7 +208,7 @@ def texture_pixels(content: bytes, most: int) -> tuple[NDArray[np.uint8], int]:
         return _texture(image), count
 
 
-def _texture(image: Any) -> NDArray[np.uint8]:
+def _texture(image: Any) -> Bytes:
     """The pixels of a PIL image; of one that is not decoded yet, only in the formats of
     photographs."""
     if image.format is not None and image.format not in PICTURE_STARTS:

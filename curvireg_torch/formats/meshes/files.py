@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import MAX_MESH_LINES, CurviregError, MeshError, MissingFileError
+from ...errors import CurviregError, MeshError, MissingFileError
 from ...utils.choices import MESHES
 from ...utils.files import file_digest, foreign_content, text_digest
 from .cad import read_collada, read_step
 from .gltf import read_gltf
+from .limits import check_lines
 from .obj import read_obj
 from .ply import read_ply
 from .polygons import triangles_of_faces
@@ -117,25 +118,20 @@ def read_source(source: MeshSource, link: str | None = None) -> ReadMesh:
     except CurviregError as error:
         raise error.with_subject(path) from None
     except IndexError as error:
-        message = (
-            "cannot be read as a mesh (a face names a vertex that the file lacks); "
-            "re-export the "
-            "file"
-        )
-        raise MeshError(message, subject=path) from error
+        raise _unreadable(path, "a face names a vertex that the file lacks") from error
     except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".removeprefix("ValueError: ").split())[
-            :300
-        ]
-        if "unexpected length" in reason:  # what trimesh says of both
+        words = f"{type(error).__name__}: {error}".removeprefix("ValueError: ").split()
+        reason = " ".join(words)[:300]
+        if "unexpected length" in reason:  # what trimesh says of two mistakes
             reason = (
-                "the file ends too early, or has binary faces with different numbers of "
-                "corners: "
+                "the file ends too early, or has binary faces with different numbers of corners: "
                 "export triangles"
             )
-        raise MeshError(
-            f"cannot be read as a mesh ({reason}); re-export the file", subject=path
-        ) from error
+        raise _unreadable(path, reason) from error
+
+
+def _unreadable(path: Path, reason: str) -> MeshError:
+    return MeshError(f"cannot be read as a mesh ({reason}); re-export the file", subject=path)
 
 
 def _check_start(path: Path) -> None:
@@ -155,8 +151,7 @@ def _check_start(path: Path) -> None:
 def _read_off(source: MeshSource) -> ReadMesh:
     """Read an OFF file; colours are ignored."""
     data = plain_text(source.data())
-    if data.count(b"\n") > MAX_MESH_LINES:
-        raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
+    check_lines(data)
     header, _, rest = re.sub(rb"#[^\n]*+", b"", data).partition(b"OFF")
     lines = [line.split() for line in rest.splitlines() if line.strip()]
     if len(header) > 16 or not lines:

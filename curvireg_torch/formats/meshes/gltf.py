@@ -12,15 +12,20 @@ import math
 import struct
 import urllib.parse
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from trimesh.transformations import quaternion_matrix
 
-from ...errors import MAX_MESH_BYTES, MAX_MESH_FACES, MAX_MESH_PARTS, MAX_TABLE_BYTES
+from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TABLE_BYTES
+from ...utils.arrays import Array, Bytes, Floats, Integers
 from ...utils.srgb import srgb
-from .colours import SurfaceColours
-from .source import MeshSource, Pixels, ReadMesh, as_plain_numbers
+from .colours import Painting, SurfaceColours, byte_colours
+from .limits import check_faces, check_parts
+from .source import MeshSource, ReadMesh, as_plain_numbers
+
+Tree = dict[str, Any]
 
 # Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or are
 # read here
@@ -39,6 +44,8 @@ _TRIANGLES = 4
 _STRIP = 5
 _FAN = 6
 SKINNED_AT_ONCE = 100_000  # Vertices, each with a matrix of 128 bytes
+_OTHER_VERSION = "only glTF version 2 is read; export version 2"
+_ENDS_EARLY = "the file ends too early, or is no GLB"
 _SPECULAR = "KHR_materials_pbrSpecularGlossiness"
 _TRANSFORM = "KHR_texture_transform"
 
@@ -66,26 +73,29 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
     if not data.startswith(b"glTF"):
         return data.removeprefix(b"\xef\xbb\xbf"), None
     if len(data) < 20:
-        raise ValueError("the file ends too early")
-    version, length, size, kind = struct.unpack_from("<III4s", data, 4)
+        raise ValueError(_ENDS_EARLY)
+    version, length = struct.unpack_from("<II", data, 4)
     if version != 2:
-        raise ValueError("only glTF version 2 is read; export version 2")
-    if kind != b"JSON" or length > len(data) or 20 + size > len(data):
-        raise ValueError("the file ends too early, or is no GLB")
-    text = data[20 : 20 + size]
-    rest = data[20 + size :]
-    if len(rest) < 8:
-        return text, None
-    size, kind = struct.unpack_from("<I4s", rest)
-    if kind != b"BIN\0" or 8 + size > len(rest):
-        raise ValueError("the file ends too early, or is no GLB")
-    return text, rest[8 : 8 + size]
+        raise ValueError(_OTHER_VERSION)
+    if length > len(data):
+        raise ValueError(_ENDS_EARLY)
+    text = _chunk(data, 12, b"JSON")
+    start = 20 + len(text)
+    return text, _chunk(data, start, b"BIN\0") if start + 8 <= len(data) else None
+
+
+def _chunk(data: bytes, start: int, expected: bytes) -> bytes:
+    size, kind = struct.unpack_from("<I4s", data, start)
+    content = data[start + 8 : start + 8 + size]
+    if kind != expected or len(content) < size:
+        raise ValueError(_ENDS_EARLY)
+    return content
 
 
 def _check(tree: Any) -> None:
     """Refuse what is not read, or would take too much memory, before anything is copied."""
     if not str(tree["asset"]["version"]).startswith("2."):
-        raise ValueError("only glTF version 2 is read; export version 2")
+        raise ValueError(_OTHER_VERSION)
     names = [str(name) for name in tree.get("extensionsRequired", [])]
     names += [
         name
@@ -109,7 +119,7 @@ def _natural(value: Any) -> int:
     return value
 
 
-def _check_sizes(tree: dict[str, Any]) -> None:
+def _check_sizes(tree: Tree) -> None:
     """Bounds on views of buffers, accessors, and every copy of a part."""
     accessors = tree.get("accessors", [])
     copied = sum(_natural(view["byteLength"]) for view in tree.get("bufferViews", []))
@@ -129,7 +139,7 @@ def _check_sizes(tree: dict[str, Any]) -> None:
             )
         return int(accessor["count"])
 
-    def corners(part: dict[str, Any]) -> int:
+    def corners(part: Tree) -> int:
         """Corners of the faces of a part, or its vertices if these are more."""
         used = [*part["attributes"].values(), *([part["indices"]] if "indices" in part else [])]
         factor = 3 if part.get("mode") in (_STRIP, _FAN) else 1
@@ -140,23 +150,20 @@ def _check_sizes(tree: dict[str, Any]) -> None:
         for mesh in tree.get("meshes", [])
     ]
     copies = [meshes[_natural(node["mesh"])] for node in tree.get("nodes", []) if "mesh" in node]
-    parts, most = (sum(column) for column in zip((0, 0), *copies, strict=True))
-    if parts > MAX_MESH_PARTS:
-        raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
-    if most > 3 * MAX_MESH_FACES:
-        raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
+    check_parts(sum(parts for parts, _ in copies))
+    check_faces(sum(most for _, most in copies) / 3)
 
 
-def _check_nodes(tree: dict[str, Any]) -> None:
+def _check_nodes(tree: Tree) -> None:
     """Every node must be the child of one node at most, and a root of none: else the nodes form a
     circle, or more."""
     nodes = tree.get("nodes", [])
     scenes = tree.get("scenes", [])
-    if len(nodes) > 10 * MAX_MESH_PARTS:
-        raise ValueError(f"more than {10 * MAX_MESH_PARTS:,} nodes; join them")
-    joints = sum(len(skin["joints"]) for skin in tree.get("skins", []))
-    if joints > 10 * MAX_MESH_PARTS:
-        raise ValueError(f"more than {10 * MAX_MESH_PARTS:,} joints; export it without skins")
+    most = 10 * MAX_MESH_PARTS
+    if len(nodes) > most:
+        raise ValueError(f"more than {most:,} nodes; join them")
+    if sum(len(skin["joints"]) for skin in tree.get("skins", [])) > most:
+        raise ValueError(f"more than {most:,} joints; export it without skins")
     named = [child for node in nodes for child in node.get("children", [])]
     named += scenes[_natural(tree.get("scene", 0))].get("nodes", []) if scenes else []
     if len(set(map(_natural, named))) < len(named) or max(named, default=-1) >= len(nodes):
@@ -166,13 +173,13 @@ def _check_nodes(tree: dict[str, Any]) -> None:
 class _File:
     """A checked glTF tree and what it names."""
 
-    def __init__(self, tree: dict[str, Any], binary: bytes | None, source: MeshSource) -> None:
+    def __init__(self, tree: Tree, binary: bytes | None, source: MeshSource) -> None:
         self._tree = tree
         self._binary = binary
         self._source = source
         self._buffers: dict[int, bytes] = {}
-        self._parts: dict[int, list[tuple[dict[str, Any], ReadMesh]]] = {}
-        self._skins: dict[int, NDArray[np.float64]] = {}
+        self._parts: dict[int, list[tuple[Tree, ReadMesh]]] = {}
+        self._skins: dict[int, Floats] = {}
         self._places = dict(self._nodes())
 
     def mesh(self) -> ReadMesh:
@@ -184,27 +191,19 @@ class _File:
                 found += [self._placed(node, place, *part) for part in self._mesh(node["mesh"])]
         return ReadMesh.joined(found)
 
-    def _placed(
-        self, node: dict[str, Any], place: NDArray[np.float64], part: dict[str, Any], mesh: ReadMesh
-    ) -> ReadMesh:
+    def _placed(self, node: Tree, place: Floats, part: Tree, mesh: ReadMesh) -> ReadMesh:
         attributes = part["attributes"]
-        if "skin" not in node or "JOINTS_0" not in attributes or "WEIGHTS_0" not in attributes:
+        if "skin" not in node or not {"JOINTS_0", "WEIGHTS_0"} <= attributes.keys():
             return mesh.transformed(place)
-        vertices = self._skinned(node["skin"], attributes, mesh.vertices)
-        return ReadMesh(vertices, mesh.faces, mesh.colours)
+        return replace(mesh, vertices=self._skinned(node["skin"], attributes, mesh.vertices))
 
-    def _skinned(
-        self, index: int, attributes: dict[str, int], vertices: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _skinned(self, index: int, attributes: dict[str, int], vertices: Floats) -> Floats:
         """Vertices moved by the joints of a skin; its node's own place does not count."""
         T = self._joints(_natural(index))
         joints = self._accessor(attributes["JOINTS_0"]).astype(np.int64)
         weights = self._accessor(attributes["WEIGHTS_0"])
-        if (
-            len(joints) != len(vertices)
-            or len(weights) != len(vertices)
-            or joints.max(initial=0) >= len(T)
-        ):
+        fits = len(joints) == len(weights) == len(vertices)
+        if not fits or joints.max(initial=0) >= len(T):
             raise ValueError("a skin does not fit its mesh")
         weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
         moved = np.zeros_like(vertices)
@@ -216,7 +215,7 @@ class _File:
                 moved[block] += weights[block, k, None] * (turned + at[:, :3, 3])
         return moved
 
-    def _joints(self, index: int) -> NDArray[np.float64]:
+    def _joints(self, index: int) -> Floats:
         """(J, 4, 4) what the joints of a skin do to a vertex that they alone move."""
         if index not in self._skins:
             skin = self._tree["skins"][index]
@@ -227,7 +226,7 @@ class _File:
             self._skins[index] = T
         return self._skins[index]
 
-    def _nodes(self) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    def _nodes(self) -> Iterator[tuple[int, Floats]]:
         """The nodes of the scene and their places in it."""
         nodes = self._tree.get("nodes", [])
         scenes = self._tree.get("scenes", [])
@@ -243,24 +242,22 @@ class _File:
             yield index, place
             waiting += [(child, place) for child in reversed(nodes[index].get("children", []))]
 
-    def _mesh(self, index: int) -> list[tuple[dict[str, Any], ReadMesh]]:
+    def _mesh(self, index: int) -> list[tuple[Tree, ReadMesh]]:
         if index not in self._parts:
             mesh = self._tree["meshes"][index]
             if any(mesh.get("weights", [])):
                 self._source.warn(
                     "skin", "its morph targets are left out: the shape is that without them"
                 )
-            parts = [
-                part
+            self._parts[index] = [
+                (part, self._part(part))
                 for part in mesh["primitives"]
                 if part.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
-            ]
-            self._parts[index] = [
-                (part, self._part(part)) for part in parts if "POSITION" in part["attributes"]
+                and "POSITION" in part["attributes"]
             ]
         return self._parts[index]
 
-    def _part(self, part: dict[str, Any]) -> ReadMesh:
+    def _part(self, part: Tree) -> ReadMesh:
         vertices = self._accessor(part["attributes"]["POSITION"])
         if "indices" in part:
             indices = self._accessor(part["indices"], as_stored=True)[:, 0].astype(np.int64)
@@ -271,34 +268,29 @@ class _File:
         faces = _faces(indices, part.get("mode", _TRIANGLES))
         return ReadMesh(vertices, faces, self._colours(part, faces, len(vertices)))
 
-    def _colours(
-        self, part: dict[str, Any], faces: NDArray[np.int64], count: int
-    ) -> SurfaceColours | None:
+    def _colours(self, part: Tree, faces: Integers, count: int) -> SurfaceColours | None:
         """Vertex colours times the colour of the material times its texture."""
         attributes = part["attributes"]
         if "material" not in part and "COLOR_0" not in attributes:
             return None
-        plain = SurfaceColours.plain(len(faces))
         material = self._tree["materials"][_natural(part["material"])] if "material" in part else {}
         factor, info = _base_colour(material)
-        tint = np.broadcast_to(srgb(factor), (len(faces), 3, 3))
+        tint = srgb(factor)
         if "COLOR_0" in attributes:
             colours = self._accessor(attributes["COLOR_0"], normalized=True)[:, :3]
             if colours.shape != (count, 3):
                 raise ValueError("vertex colours that do not fit the vertices")
             tint = tint * np.clip(np.nan_to_num(colours), 0.0, 1.0)[faces]
-        corners = np.round(255.0 * tint).astype(np.uint8)
-        pixels = None if info is None else self._texture(info)
-        if pixels is None or info is None:
-            return SurfaceColours(corners, plain.uv, plain.texture)
-        uv = self._coordinates(info, attributes, count)
-        if uv is None:
-            return SurfaceColours(corners, plain.uv, plain.texture)
-        return SurfaceColours(corners, uv[faces], np.zeros(len(faces), np.int32), (pixels,))
+        painting = Painting(len(faces))
+        painting.corners[:] = byte_colours(tint)
+        texture = None if info is None else self._texture(info)
+        if info is not None and texture is not None:
+            uv = self._coordinates(info, attributes, count)
+            if uv is not None:
+                painting.add_texture(slice(None), texture, uv[faces])
+        return painting.finished()
 
-    def _coordinates(
-        self, info: dict[str, Any], attributes: dict[str, int], count: int
-    ) -> NDArray[np.float32] | None:
+    def _coordinates(self, info: Tree, attributes: dict[str, int], count: int) -> Floats | None:
         """(V, 2) texture coordinates from the bottom left, in the set and by the transform that the
         texture names."""
         transform = info.get("extensions", {}).get(_TRANSFORM, {})
@@ -312,19 +304,16 @@ class _File:
         uv = self._accessor(attributes[name], normalized=True)
         if uv.shape != (count, 2):
             raise ValueError("texture coordinates that do not fit the vertices")
-        u, v = np.nan_to_num(uv, posinf=0.0, neginf=0.0).T
         scale = as_plain_numbers(transform.get("scale"), 2, (1.0, 1.0))
         offset = as_plain_numbers(transform.get("offset"), 2, (0.0, 0.0))
         angle = float(transform.get("rotation", 0.0))
-        u = scale[0] * u
-        v = scale[1] * v
         cos = math.cos(angle)
         sin = math.sin(angle)
-        turned_u = cos * u + sin * v + offset[0]
-        turned_v = cos * v - sin * u + offset[1]
-        return np.column_stack([turned_u, 1.0 - turned_v]).astype(np.float32)
+        scaled = scale * np.nan_to_num(uv, posinf=0.0, neginf=0.0)
+        turned = scaled @ np.array([[cos, -sin], [sin, cos]]) + offset
+        return np.asarray(np.array([0.0, 1.0]) + turned * np.array([1.0, -1.0]))
 
-    def _texture(self, info: dict[str, Any]) -> Pixels | None:
+    def _texture(self, info: Tree) -> Bytes | None:
         texture = self._tree["textures"][_natural(info["index"])]
         webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
         index = webp.get("source", texture.get("source"))
@@ -344,9 +333,7 @@ class _File:
             return self._source.texture(("image", index), lambda: _data_of(uri), name)
         return self._source.texture_file(urllib.parse.unquote(uri))
 
-    def _accessor(
-        self, index: Any, *, normalized: bool = False, as_stored: bool = False
-    ) -> NDArray[Any]:
+    def _accessor(self, index: Any, *, normalized: bool = False, as_stored: bool = False) -> Array:
         """(count, width) values of an accessor as float64; integers that stand for fractions are
         divided."""
         accessor = self._tree["accessors"][_natural(index)]
@@ -355,16 +342,14 @@ class _File:
         stored = self._stored(accessor, kind, width, accessor["count"])
         if "sparse" in accessor:
             stored = self._with_exceptions(stored, accessor["sparse"])
-        if as_stored or kind.kind == "f":
-            return stored if as_stored else stored.astype(np.float64)
+        if as_stored:
+            return stored
         values = stored.astype(np.float64)
-        if normalized or accessor.get("normalized"):
+        if kind.kind != "f" and (normalized or accessor.get("normalized")):
             values = np.maximum(values / np.iinfo(kind).max, -1.0)
         return values
 
-    def _stored(
-        self, place: dict[str, Any], kind: np.dtype[Any], width: int, count: int
-    ) -> NDArray[Any]:
+    def _stored(self, place: Tree, kind: np.dtype[Any], width: int, count: int) -> Array:
         """(count, width) values at the ``place`` in a view that an accessor, or a part of one,
         names; zeros where it names none."""
         if "bufferView" not in place:
@@ -378,7 +363,7 @@ class _File:
             raise ValueError("an accessor is longer than its data; the file ends too early")
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
 
-    def _with_exceptions(self, stored: NDArray[Any], sparse: dict[str, Any]) -> NDArray[Any]:
+    def _with_exceptions(self, stored: Array, sparse: Tree) -> Array:
         """Values of a sparse accessor: those stored, but for some, which are named one by one."""
         count = _natural(sparse["count"])
         if count > len(stored):
@@ -407,66 +392,52 @@ class _File:
         if index not in self._buffers:
             buffer = self._tree["buffers"][index]
             uri = buffer.get("uri")
-            if uri is None:
-                content = self._binary if index == 0 else None
-                if content is None:
-                    raise ValueError("a buffer without content")
-            elif str(uri).startswith("data:"):
-                content = _data_of(str(uri))
+            if uri is not None and str(uri).startswith("data:"):
+                self._buffers[index] = _data_of(str(uri))
+            elif uri is not None:
+                self._buffers[index] = self._source.read(urllib.parse.unquote(str(uri)))
+            elif index == 0 and self._binary is not None:
+                self._buffers[index] = self._binary
             else:
-                content = self._source.read(urllib.parse.unquote(str(uri)))
-            self._buffers[index] = content
+                raise ValueError("a buffer without content")
         return self._buffers[index]
 
 
-def _local(node: dict[str, Any]) -> NDArray[np.float64]:
+def _local(node: Tree) -> Floats:
     """(4, 4) place of a node below its parent."""
     if "matrix" in node:
         return as_plain_numbers(node["matrix"], 16, ()).reshape(4, 4).T
-    T = np.eye(4)
     x, y, z, w = as_plain_numbers(node.get("rotation"), 4, (0.0, 0.0, 0.0, 1.0))
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    if norm > 0.0:
-        x = x / norm
-        y = y / norm
-        z = z / norm
-        w = w / norm
-        T[0, :3] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
-        T[1, :3] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
-        T[2, :3] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    T = np.asarray(quaternion_matrix((w, x, y, z)))
     T[:3, :3] *= as_plain_numbers(node.get("scale"), 3, (1.0, 1.0, 1.0))
     T[:3, 3] = as_plain_numbers(node.get("translation"), 3, (0.0, 0.0, 0.0))
     return T
 
 
-def _faces(indices: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
+def _faces(indices: Integers, mode: int) -> Integers:
     """(F, 3) faces of triangles, of a strip, whose every second one is turned over, or of a fan."""
     if mode == _TRIANGLES:
         return indices[: len(indices) // 3 * 3].reshape(-1, 3)
-    if len(indices) < 3:
-        return np.zeros((0, 3), np.int64)
-    second = indices[1:-1]
-    third = indices[2:]
+    first = indices[:-2]
     if mode == _FAN:
-        return np.column_stack([np.full(len(second), indices[0]), second, third])
-    faces = np.column_stack([indices[:-2], second, third])
-    faces[1::2] = faces[1::2, ::-1]
+        first = np.repeat(indices[:1], len(first))
+    faces = np.column_stack([first, indices[1:-1], indices[2:]])
+    if mode == _STRIP:
+        faces[1::2] = faces[1::2, ::-1]
     return faces
 
 
-def _base_colour(material: dict[str, Any]) -> tuple[NDArray[np.float64], dict[str, Any] | None]:
+def _base_colour(material: Tree) -> tuple[Floats, Tree | None]:
     """(3,) linear colour of a material, and its texture, if any."""
     specular = material.get("extensions", {}).get(_SPECULAR)
     metallic = material.get("pbrMetallicRoughness", {})
-    factor = metallic.get("baseColorFactor") if specular is None else specular.get("diffuseFactor")
-    info = metallic.get("baseColorTexture") if specular is None else specular.get("diffuseTexture")
-    return as_plain_numbers(factor, 4, (1.0,) * 4)[:3], info
+    kind, values = ("baseColor", metallic) if specular is None else ("diffuse", specular)
+    factor = as_plain_numbers(values.get(f"{kind}Factor"), 4, (1.0,) * 4)
+    return factor[:3], values.get(f"{kind}Texture")
 
 
 def _data_of(uri: str) -> bytes:
     head, _, content = uri.partition(",")
-    return (
-        base64.b64decode(content)
-        if head.endswith(";base64")
-        else urllib.parse.unquote_to_bytes(content)
-    )
+    if head.endswith(";base64"):
+        return base64.b64decode(content)
+    return urllib.parse.unquote_to_bytes(content)

@@ -7,22 +7,15 @@ scripts/upstream, several libraries, and options of textures, this reader can go
 
 import re
 from dataclasses import dataclass, field
+from itertools import takewhile
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...errors import MAX_MESH_FACES, MAX_MESH_LINES, MAX_MESH_PARTS
-from .colours import SurfaceColours
-from .polygons import divide_faces
-from .source import (
-    MeshSource,
-    Pixels,
-    ReadMesh,
-    colour_bytes,
-    numbers,
-    plain_text,
-    spellings,
-)
+from ...utils.arrays import Bytes, Floats, Integers
+from .colours import Painting, SurfaceColours, byte_colours
+from .limits import check_faces, check_lines, check_parts
+from .polygons import triangles_of_faces
+from .source import MeshSource, ReadMesh, colour_bytes, numbers, plain_text, spellings
 
 CHUNK = 100_000  # Lines of faces that are read at once, which bounds the memory
 # Corners of one form: v, v/vt and v/vt/vn. Possessive, so that no text takes long to be refused.
@@ -32,23 +25,11 @@ _FORMS = {
 }
 _NAMES = (b"usemtl", b"o", b"g", b"mtllib")
 _NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-# Options of a texture in an MTL file, and how many words follow; "numbers": up to three numbers
-_MAP_OPTIONS: dict[bytes, int | str] = {
-    b"-s": "numbers",
-    b"-o": "numbers",
-    b"-t": "numbers",
-    b"-mm": 2,
-    b"-bm": 1,
-    b"-blendu": 1,
-    b"-blendv": 1,
-    b"-boost": 1,
-    b"-cc": 1,
-    b"-clamp": 1,
-    b"-colorspace": 1,
-    b"-imfchan": 1,
-    b"-texres": 1,
-    b"-type": 1,
-}
+# Options of a texture in an MTL file, and how many words follow; 0: up to three numbers
+_MAP_OPTIONS = {b"-s": 0, b"-o": 0, b"-t": 0, b"-mm": 2}
+_MAP_OPTIONS |= dict.fromkeys(
+    b"-bm -blendu -blendv -boost -cc -clamp -colorspace -imfchan -texres -type".split(), 1
+)
 
 
 @dataclass
@@ -88,8 +69,7 @@ def read_obj(source: MeshSource) -> ReadMesh:
     """Read an OBJ file with its colours: textures, colours of materials, or colours behind the
     coordinates."""
     data = plain_text(source.data())
-    if data.count(b"\n") > MAX_MESH_LINES:
-        raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
+    check_lines(data)
     lines = _lines_of(data)
     points, point_colours = _points(lines.points)
     corners, counts = _corners(lines)
@@ -144,44 +124,56 @@ def _noted(found: _Lines, parts: set[bytes], key: bytes, name: bytes, current: i
         found.libraries[name] = None
     else:
         parts.add(name)
-    if max(len(parts), len(found.materials), len(found.libraries)) > MAX_MESH_PARTS:
-        raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
+    check_parts(max(len(parts), len(found.materials), len(found.libraries)))
     return current
 
 
-def _table(
-    lines: list[bytes], least: int, what: str
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """All numbers of some lines, and how many each line has, at least ``least``."""
-    counts = np.fromiter((len(line.split()) for line in lines), np.int64, len(lines))
-    if len(counts) and counts.min() < least:
+@dataclass
+class _Table:
+    """The numbers of some lines, and (N,) how many each line has, and where its first one is."""
+
+    values: Floats
+    counts: Integers
+
+    @property
+    def first(self) -> Integers:
+        return np.cumsum(self.counts) - self.counts
+
+
+def _table(lines: list[bytes], least: int, what: str) -> _Table:
+    """The numbers of some lines, of which each has at least ``least``."""
+    counts = _word_counts(lines)
+    if counts.min(initial=least) < least:
         raise ValueError(f"{what} has fewer than {least} coordinates")
-    return numbers(b"\n".join(lines)), counts
+    return _Table(numbers(b"\n".join(lines)), counts)
 
 
-def _points(lines: list[bytes]) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
+def _word_counts(lines: list[bytes]) -> Integers:
+    return np.fromiter((len(line.split()) for line in lines), np.int64, len(lines))
+
+
+def _points(lines: list[bytes]) -> tuple[Floats, Bytes | None]:
     """(V, 3) coordinates, and (V, 3) colours if any line has some; the others are white."""
-    values, counts = _table(lines, 3, "a vertex")
-    first = np.cumsum(counts) - counts
-    points = values[first[:, None] + np.arange(3)]
-    weighted = (counts == 4).nonzero()[0]
+    table = _table(lines, 3, "a vertex")
+    first = table.first
+    points = table.values[first[:, None] + np.arange(3)]
+    weighted = (table.counts == 4).nonzero()[0]
     if len(weighted):
-        weight = values[first[weighted] + 3]
+        weight = table.values[first[weighted] + 3]
         points[weighted] /= np.where(weight == 0.0, 1.0, weight)[:, None]
-    coloured = (counts >= 6).nonzero()[0]
+    coloured = (table.counts >= 6).nonzero()[0]
     if not len(coloured):
         return points, None
     colours = np.full((len(points), 3), 255, np.uint8)
-    colours[coloured] = colour_bytes(values[first[coloured][:, None] + np.arange(3, 6)])
+    colours[coloured] = colour_bytes(table.values[first[coloured][:, None] + np.arange(3, 6)])
     return points, colours
 
 
-def _corners(lines: _Lines) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _corners(lines: _Lines) -> tuple[Integers, Integers]:
     """(N, 2) vertex and texture coordinate (-1: none) of the corners of all faces, counted from 0,
     and (F,) how many corners each face has."""
-    counts = np.fromiter((len(line.split()) for line in lines.faces), np.int64, len(lines.faces))
-    if np.maximum(counts - 2, 0).sum() > MAX_MESH_FACES:
-        raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
+    counts = _word_counts(lines.faces)
+    check_faces(np.maximum(counts - 2, 0).sum())
     chunks = [_indices(lines.faces[k : k + CHUNK]) for k in range(0, len(lines.faces), CHUNK)]
     indices = np.concatenate([np.zeros((0, 2), np.int64), *chunks])
     before = np.column_stack([lines.points_before, lines.uv_before]).reshape(-1, 2)
@@ -196,7 +188,7 @@ def _corners(lines: _Lines) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return corners, counts
 
 
-def _indices(lines: list[bytes]) -> NDArray[np.int64]:
+def _indices(lines: list[bytes]) -> Integers:
     """(N, 2) indices of vertices and texture coordinates as written, 0 for none."""
     text = b" " + b"\n ".join(lines)
     text = text.replace(b"//", b"/0/")
@@ -209,58 +201,43 @@ def _indices(lines: list[bytes]) -> NDArray[np.int64]:
     return np.array([[int(v), int(vt or 0)] for v, vt in rows], np.int64).reshape(-1, 2)
 
 
-def _triangles(
-    points: NDArray[np.float64], corners: NDArray[np.int64], counts: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _triangles(points: Floats, corners: Integers, counts: Integers) -> tuple[Integers, Integers]:
     """(T,) the faces of the triangles, and (T, 3) their corners."""
     first = np.cumsum(counts) - counts
     simple = (counts == 3).nonzero()[0]
-    picked = first[simple][:, None] + np.arange(3)
     many = (counts > 3).nonzero()[0]
-    if not len(many):
-        return simple, picked
     polygons = [corners[first[k] : first[k] + counts[k], 0].tolist() for k in many]
-    divided = divide_faces(points, polygons)
-    lengths = np.fromiter(map(len, divided), np.int64, len(divided))
-    places = np.array(
-        [triangle for triangles in divided for triangle in triangles], np.int64
-    ).reshape(-1, 3)
-    owner = np.repeat(many, lengths)
-    face_of = np.concatenate([simple, owner])
-    picked = np.concatenate([picked, first[owner][:, None] + places])
+    _, owner, places = triangles_of_faces(points, polygons)
+    face_of = np.concatenate([simple, many[owner]])
+    places = np.concatenate([np.tile(np.arange(3), (len(simple), 1)), places])
     order = np.argsort(face_of, kind="stable")
-    return face_of[order], picked[order]
+    return face_of[order], (first[face_of][:, None] + places)[order]
 
 
 def _colours(
     source: MeshSource,
     lines: _Lines,
-    material: NDArray[np.int64],
-    faces: NDArray[np.int64],
-    uv_index: NDArray[np.int64],
-    point_colours: NDArray[np.uint8] | None,
+    material: Integers,
+    faces: Integers,
+    uv_index: Integers,
+    point_colours: Bytes | None,
 ) -> SurfaceColours | None:
     library = _libraries(source, list(lines.libraries))
-    if lines.libraries and source.warnings == []:
-        lost = [name for name in lines.materials if name not in library]
-        if lost:
-            names = ", ".join(spellings(name)[0] for name in lost[:3])
-            text = f"its MTL files lack the material {names[:100]}; its faces are shown in white"
-            source.warn("material", text)
-    if point_colours is None and not any(name in library for name in lines.materials):
+    lost = [name for name in lines.materials if name not in library]
+    if lost and lines.libraries and not source.warnings:
+        names = ", ".join(spellings(name)[0] for name in lost[:3])
+        text = f"its MTL files lack the material {names[:100]}; its faces are shown in white"
+        source.warn("material", text)
+    if point_colours is None and len(lost) == len(lines.materials):
         return None
-    colours = SurfaceColours.plain(len(faces))
-    corners = colours.corners.copy() if point_colours is None else point_colours[faces]
-    uv = colours.uv
-    texture = colours.texture
-    textures: list[Pixels] = []
-    values, counts = _table(lines.uv, 1, "a texture coordinate")
-    first = np.cumsum(counts) - counts
-    is_flat = counts < 2  # of a texture with one dimension
-    table = np.column_stack(
-        [values[first], np.where(is_flat, 0.0, values[np.minimum(first + 1, len(values) - 1)])]
-    )
-    table = np.nan_to_num(table, posinf=0.0, neginf=0.0)
+    painting = Painting(len(faces))
+    if point_colours is not None:
+        painting.corners = point_colours[faces]
+    table = _table(lines.uv, 1, "a texture coordinate")
+    u = table.values[table.first]
+    # a texture of one dimension has no v
+    v = np.where(table.counts < 2, 0.0, np.append(table.values, 0.0)[table.first + 1])
+    coordinates = np.nan_to_num(np.column_stack([u, v]), posinf=0.0, neginf=0.0)
     has_uv = (uv_index >= 0).all(axis=1)
     order = np.argsort(material, kind="stable")
     starts = np.searchsorted(material[order], np.arange(len(lines.materials) + 1))
@@ -270,16 +247,14 @@ def _colours(
         if found is None or not len(own):
             continue
         if point_colours is None and found.colour is not None:
-            corners[own] = np.round(255.0 * np.clip(found.colour, 0.0, 1.0)).astype(np.uint8)
-        pixels = None if found.texture is None else source.texture_file(*spellings(found.texture))
-        if pixels is None:
-            continue
-        own = own[np.take(has_uv, own)]
-        corners[own] = 255  # beside a texture, exporters write any colour
-        uv[own] = (table[uv_index[own]] * found.scale + found.offset).astype(np.float32)
-        texture[own] = len(textures)
-        textures.append(pixels)
-    return SurfaceColours(corners, uv, texture, tuple(textures))
+            painting.corners[own] = byte_colours(found.colour)
+        texture = None if found.texture is None else source.texture_file(*spellings(found.texture))
+        if texture is not None:
+            own = own[np.take(has_uv, own)]
+            painting.corners[own] = 255  # beside a texture, exporters write any colour
+            uv = coordinates[uv_index[own]] * found.scale + found.offset
+            painting.add_texture(own, texture, uv)
+    return painting.finished()
 
 
 def _libraries(source: MeshSource, statements: list[bytes]) -> dict[bytes, _Material]:
@@ -328,29 +303,16 @@ def _colour(text: bytes) -> tuple[float, ...] | None:
 def _set_texture(material: _Material, text: bytes) -> None:
     """The file name behind the options of a ``map_Kd``, and the options that move the texture."""
     while text.startswith(b"-"):
-        option, rest = [*text.split(None, 1), b""][:2]
-        expected = _MAP_OPTIONS.get(option.lower())
-        if expected is None:
+        word, rest = [*text.split(None, 1), b""][:2]
+        option = word.lower()
+        if option not in _MAP_OPTIONS:
             break
-        words = rest.split(None, 3)
-        count = expected if isinstance(expected, int) else _leading_numbers(words)
-        if option.lower() in (b"-s", b"-o") and count:
-            values = [float(word) for word in words[:count]]
-            default = 1.0 if option.lower() == b"-s" else 0.0
-            pair = (values[0], values[1] if count > 1 else default)
-            if option.lower() == b"-s":
-                material.scale = pair
-            else:
-                material.offset = pair
+        numeric = [*map(float, takewhile(_NUMBER.fullmatch, rest.split(None, 3)[:3]))]
+        count = _MAP_OPTIONS[option] or len(numeric)
+        if option == b"-s" and numeric:
+            material.scale = numeric[0], [*numeric, 1.0][1]
+        elif option == b"-o" and numeric:
+            material.offset = numeric[0], [*numeric, 0.0][1]
         pieces = rest.split(None, count)
         text = pieces[count] if len(pieces) > count else b""
     material.texture = text.strip().strip(b'"') or None
-
-
-def _leading_numbers(words: list[bytes]) -> int:
-    count = 0
-    for word in words[:3]:
-        if not _NUMBER.fullmatch(word):
-            break
-        count += 1
-    return count

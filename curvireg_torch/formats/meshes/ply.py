@@ -7,17 +7,18 @@ go.
 """
 
 import re
+from collections.abc import Sequence
 from io import BytesIO
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
-from ...errors import MAX_MESH_LINES
-from .colours import SurfaceColours
+from ...utils.arrays import Array, Bytes, Floats, Integers
+from .colours import Painting, SurfaceColours
+from .limits import check_lines
 from .polygons import triangles_of_faces
-from .source import MeshSource, Pixels, ReadMesh, colour_bytes, spellings
+from .source import MeshSource, ReadMesh, colour_bytes, spellings
 
 MAX_COLUMNS = 500  # Properties in a header, whose number squared bounds the time
 _COLOURS = (
@@ -46,13 +47,13 @@ def read_ply(source: MeshSource) -> ReadMesh:
     if max(header.count(b"property"), header.count(b"element")) > MAX_COLUMNS:
         raise ValueError(f"more than {MAX_COLUMNS:,} kinds of rows or columns")
     names = [name.strip() for name in _TEXTURE_FILE.findall(header)]
-    if b"ascii" in header[:100] and max(body.count(b"\n"), body.count(b"\r")) > MAX_MESH_LINES:
-        raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
-    plain = (
-        _REMARK.sub(b"", header.replace(b"\r\n", b"\n")).decode("ascii", errors="replace").encode()
-    )
+    if b"ascii" in header[:100]:
+        check_lines(body)
+    else:
+        body = body.removeprefix(b"\r")
+    plain = _REMARK.sub(b"", header.replace(b"\r\n", b"\n"))
+    plain = plain.decode("ascii", errors="replace").encode()
     plain = _CORNERS.sub(rb"\1" + _OWN_CORNERS.encode(), plain)
-    body = body.removeprefix(b"\r") if b"ascii" not in header[:100] else body
     raw = trimesh.exchange.ply.load_ply(
         BytesIO(plain + end + body), skip_materials=True, fix_texture=False
     )
@@ -63,23 +64,28 @@ def read_ply(source: MeshSource) -> ReadMesh:
         if element["length"] and any(row is None or len(row) < element["length"] for row in rows):
             raise ValueError(f"the file ends before the last {name}")
     points = _Element(elements.get("vertex", {}))
+    polygons = _Element(elements.get("face", {}))
     if not points.names:
-        return ReadMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+        return ReadMesh.joined([])
     vertices = points.table(("x", "y", "z"))
     if vertices is None:
         raise ValueError("its vertices have no x, y and z")
-    polygons = _Element(elements.get("face", {}))
     if not polygons.names and "tristrips" in elements:
         raise ValueError("its faces are strips of triangles, which are not read; export triangles")
     if not polygons.names:
         return ReadMesh(vertices, np.zeros((0, 3), np.int64))
-    lists = polygons.lists(
-        next((name for name in _FACE_LISTS if name in polygons.names), polygons.names[0])
-    )
-    faces, owner, places = _divided(vertices, lists)
-    return ReadMesh(
-        vertices, faces, _colours(source, points, polygons, names, faces, owner, places)
-    )
+    name = next((name for name in _FACE_LISTS if name in polygons.names), polygons.names[0])
+    faces = _Faces(*_divided(vertices, polygons.lists(name)))
+    return ReadMesh(vertices, faces.vertices, _colours(source, points, polygons, names, faces))
+
+
+class _Faces(NamedTuple):
+    """(T, 3) vertices of triangles, (T,) the polygons that they are of, and (T, 3) which corners of
+    these they have."""
+
+    vertices: Integers
+    owner: Integers
+    places: Integers
 
 
 class _Element:
@@ -93,14 +99,14 @@ class _Element:
         elif self._data is not None:
             self.names = list(self._data.dtype.names)
 
-    def table(self, names: tuple[str, ...]) -> NDArray[np.float64] | None:
+    def table(self, names: Sequence[str]) -> Floats | None:
         """(N, K) values of some columns, None if one is absent."""
         if self._data is None or not set(names) <= set(self.names):
             return None
         columns = [np.asarray(self._data[name], np.float64).reshape(-1) for name in names]
         return np.column_stack(columns)
 
-    def colours(self) -> NDArray[np.uint8] | None:
+    def colours(self) -> Bytes | None:
         """(N, 3) colours under one of the names that exporters use; floating ones are in [0, 1],
         and those of 16 bits are scaled if they need more than 8."""
         for names in _COLOURS:
@@ -130,99 +136,61 @@ class _Element:
         return values["f1"]
 
 
-def _divided(
-    vertices: NDArray[np.float64], lists: Any
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """(T, 3) triangles, (T,) their faces, and (T, 3) which corners of these they have."""
+def _divided(vertices: Floats, lists: Any) -> tuple[Integers, Integers, Integers]:
+    """The parts of :class:`_Faces`."""
     if np.shape(lists)[1:] == (3,):
         faces = np.asarray(lists).astype(np.int64)
         return faces, np.arange(len(faces)), np.broadcast_to(np.arange(3), faces.shape)
-    rows = [row.tolist() for row in lists]
-    return triangles_of_faces(vertices, rows)
+    return triangles_of_faces(vertices, [row.tolist() for row in lists])
 
 
 def _colours(
-    source: MeshSource,
-    points: _Element,
-    polygons: _Element,
-    names: list[bytes],
-    faces: NDArray[np.int64],
-    owner: NDArray[np.int64],
-    places: NDArray[np.int64],
+    source: MeshSource, points: _Element, polygons: _Element, names: list[bytes], faces: _Faces
 ) -> SurfaceColours | None:
     """Textures first, then colours of faces, then of vertices."""
-    plain = SurfaceColours.plain(len(faces))
-    uv = _coordinates(points, polygons, faces, owner, places) if names else None
+    painting = Painting(len(faces.vertices))
+    uv = _coordinates(points, polygons, faces) if names else None
     if uv is not None:
-        pixels = [source.texture_file(*spellings(name)) for name in names]
-        number = polygons.table(("texnumber",))
+        number = polygons.table(["texnumber"])
         if number is None and len(names) > 1:
-            text = (
-                f"it names {len(names)} textures and does not say which face has which; the "
-                f"first "
-                f"is used"
+            source.warn(
+                "texture",
+                f"it names {len(names)} textures and does not say which face has which; the first "
+                "is used",
             )
-            source.warn("texture", text)
-        texture = (
-            np.zeros(len(faces), np.int32) if number is None else number[owner, 0].astype(np.int32)
-        )
-        if any(found is not None for found in pixels):
-            return _textured(plain, uv, texture, pixels)
+        texture = np.zeros(len(uv)) if number is None else number[faces.owner, 0].astype(np.int64)
+        pixels = [source.texture_file(*spellings(name)) for name in names]
+        for index, picture in enumerate(pixels):
+            own = texture == index
+            if picture is not None:
+                painting.add_texture(own, picture, uv[own])
+        if any(picture is not None for picture in pixels):
+            return painting.finished()
     elif names:
         source.warn(
             "texture",
             "it names a texture and has no texture coordinates; the mesh is shown without it",
         )
-    colours = polygons.colours()
-    if colours is not None:
-        return SurfaceColours(
-            np.repeat(colours[owner][:, None], 3, axis=1), plain.uv, plain.texture
-        )
-    colours = points.colours()
-    if colours is not None:
-        return SurfaceColours(colours[faces], plain.uv, plain.texture)
-    return None
-
-
-def _textured(
-    plain: SurfaceColours,
-    uv: NDArray[np.float32],
-    texture: NDArray[np.int32],
-    pixels: list[Pixels | None],
-) -> SurfaceColours:
-    used = [k for k, found in enumerate(pixels) if found is not None]
-    number = np.full(len(pixels) + 1, -1, np.int32)
-    number[used] = np.arange(len(used))
-    known = np.where((texture >= 0) & (texture < len(pixels)), texture, len(pixels))
-    return SurfaceColours(
-        plain.corners, uv, number[known], tuple(found for found in pixels if found is not None)
-    )
-
-
-def _coordinates(
-    points: _Element,
-    polygons: _Element,
-    faces: NDArray[np.int64],
-    owner: NDArray[np.int64],
-    places: NDArray[np.int64],
-) -> NDArray[np.float32] | None:
-    """(T, 3, 2) texture coordinates, of the faces' corners or of the vertices."""
-    if _OWN_CORNERS in polygons.names:
-        rows = polygons.lists(_OWN_CORNERS)
-        starts = np.cumsum([0, *map(len, rows)])
-        values = (
-            np.concatenate([np.asarray(row, np.float64) for row in rows])
-            if len(rows)
-            else np.zeros(0)
-        )
-        at = starts[:-1][owner][:, None] + 2 * places
-        if (at + 2 > starts[1:][owner][:, None]).any():
-            raise ValueError("texture coordinates that do not fit the faces")
-        uv = np.stack([values[at], values[at + 1]], axis=-1)
+    of_faces = polygons.colours()
+    of_points = points.colours()
+    if of_faces is not None:
+        painting.corners[:] = of_faces[faces.owner][:, None]
+    elif of_points is not None:
+        painting.corners = of_points[faces.vertices]
     else:
+        return None
+    return painting.finished()
+
+
+def _coordinates(points: _Element, polygons: _Element, faces: _Faces) -> Array | None:
+    """(T, 3, 2) texture coordinates, of the faces' corners or of the vertices."""
+    if _OWN_CORNERS not in polygons.names:
         tables = [points.table(names) for names in _COORDINATES]
-        found = next((table for table in tables if table is not None), None)
-        if found is None:
-            return None
-        uv = found[faces]
-    return np.nan_to_num(uv, posinf=0.0, neginf=0.0).astype(np.float32)
+        return next((table[faces.vertices] for table in tables if table is not None), None)
+    rows = polygons.lists(_OWN_CORNERS)
+    starts = np.cumsum([0, *map(len, rows)])
+    values = np.concatenate([np.zeros(0), *rows])
+    at = starts[:-1][faces.owner][:, None] + 2 * faces.places
+    if (at + 2 > starts[1:][faces.owner][:, None]).any():
+        raise ValueError("texture coordinates that do not fit the faces")
+    return np.stack([values[at], values[at + 1]], axis=-1)

@@ -9,19 +9,19 @@ from collections.abc import Sequence
 
 import mapbox_earcut
 import numpy as np
-from numpy.typing import NDArray
 
-from ...errors import MAX_MESH_FACES, MAX_POLYGON_WORK
+from ...errors import MAX_POLYGON_WORK
+from ...utils.arrays import Array, Floats, Integers
+from .limits import check_faces
 
 Triangles = list[list[list[int]]]  # For each face its triangles, as positions among its corners
 
 
-def divide_faces(vertices: NDArray[np.float64], faces: Sequence[Sequence[int]]) -> Triangles:
+def divide_faces(vertices: Floats, faces: Sequence[Sequence[int]]) -> Triangles:
     """Triangles that cover planar faces: fans of convex ones, others by earcut. Corners on straight
     edges may drop out. Raises ValueError where a vertex does not exist, or the faces are beyond
     :mod:`curvireg_torch.errors`."""
-    if sum(max(len(face) - 2, 0) for face in faces) > MAX_MESH_FACES:
-        raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
+    check_faces(sum(max(len(face) - 2, 0) for face in faces))
     if any(not 0 <= min(face) <= max(face) < len(vertices) for face in faces if face):
         raise ValueError("a face names a vertex that does not exist")
     triangles = [[[0, i, i + 1] for i in range(1, len(face) - 1)] for face in faces]
@@ -44,7 +44,7 @@ def divide_faces(vertices: NDArray[np.float64], faces: Sequence[Sequence[int]]) 
     return triangles
 
 
-def _flattened(polygons: NDArray[np.float64]) -> NDArray[np.float64]:
+def _flattened(polygons: Floats) -> Floats:
     """(N, n, 2) corners without the coordinate along which the plane is steepest, anticlockwise."""
     points = polygons - polygons[:, :1]
     normal = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)
@@ -57,7 +57,7 @@ def _flattened(polygons: NDArray[np.float64]) -> NDArray[np.float64]:
     return flat
 
 
-def _is_concave(flat: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _is_concave(flat: Floats) -> Array:
     """(N,): whether some corner of an anticlockwise polygon turns clockwise; False with NaN, which
     as_mesh refuses."""
     edges = np.roll(flat, -1, axis=1) - flat
@@ -68,18 +68,13 @@ def _is_concave(flat: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def triangles_of_faces(
-    vertices: NDArray[np.float64], faces: Sequence[Sequence[int]]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    vertices: Floats, faces: Sequence[Sequence[int]]
+) -> tuple[Integers, Integers, Integers]:
     """(T, 3) vertices of the triangles of :func:`divide_faces`, (T,) the faces that they are of,
     and (T, 3) which corners of these they have."""
     divided = divide_faces(vertices, faces)
-    triangles = [
-        [face[i] for i in one] for face, parts in zip(faces, divided, strict=True) for one in parts
-    ]
-    places = [one for parts in divided for one in parts]
     owner = np.repeat(np.arange(len(faces)), list(map(len, divided)))
-    return (
-        np.array(triangles, np.int64).reshape(-1, 3),
-        owner,
-        np.array(places, np.int64).reshape(-1, 3),
-    )
+    places = np.array([one for parts in divided for one in parts], np.int64).reshape(-1, 3)
+    starts = np.cumsum([0, *map(len, faces)])[owner]
+    corners = np.array([corner for face in faces for corner in face], np.int64)
+    return corners[starts[:, None] + places], owner, places

@@ -35,8 +35,7 @@ def joined_scene(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceC
     mesh = trimesh.util.concatenate(parts)
     if all(each is None for each in found):
         return mesh, None
-    known = [
-        each or SurfaceColours.plain(len(part.faces))
-        for each, part in zip(found, parts, strict=True)
-    ]
-    return mesh, SurfaceColours.cat(known)
+    pairs = zip(found, parts, strict=True)
+    return mesh, SurfaceColours.cat(
+        [each or SurfaceColours.plain(len(part.faces)) for each, part in pairs]
+    )

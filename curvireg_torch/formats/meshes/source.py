@@ -3,18 +3,19 @@ warnings."""
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence, Sized
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TEXTURE_PIXELS
+from ...utils.arrays import Bytes, Floats, Integers
+from ...utils.choices import UNITS
 from .colours import SurfaceColours, texture_pixels
 
-Pixels = NDArray[np.uint8]
 MOST_WARNINGS = 5  # Of one kind
 # Bytes and parts of a file's name, and bytes of each part: no longer one is that of a file
 MAX_NAME_BYTES = 4096
@@ -55,8 +56,8 @@ class ReadMesh:
         warnings: what was left out of it.
     """
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: Floats
+    faces: Integers
     colours: SurfaceColours | None = None
     unit: str | None = None
     up: str | None = None
@@ -73,40 +74,44 @@ class ReadMesh:
         if is_used.all():
             return self
         number = np.cumsum(is_used) - 1
-        vertices = self.vertices[is_used]
-        return ReadMesh(vertices, number[self.faces], self.colours, self.unit, self.up)
+        return replace(self, vertices=self.vertices[is_used], faces=number[self.faces])
 
-    def transformed(self, T: NDArray[np.float64]) -> "ReadMesh":
+    def transformed(self, T: Floats) -> "ReadMesh":
         """The mesh at another place, by a (4, 4) affine transform; mirrored faces are turned
         over."""
-        vertices = self.vertices @ T[:3, :3].T + T[:3, 3]
-        if np.linalg.det(T[:3, :3]) >= 0.0:
-            return ReadMesh(vertices, self.faces, self.colours, self.unit, self.up)
+        moved = replace(self, vertices=self.vertices @ T[:3, :3].T + T[:3, 3])
+        return moved if np.linalg.det(T[:3, :3]) >= 0.0 else moved.turned_over()
+
+    def turned_over(self) -> "ReadMesh":
+        """The mesh with the other sides of its faces outside."""
         colours = self.colours
         if colours is not None:
-            colours = SurfaceColours(
-                colours.corners[:, ::-1], colours.uv[:, ::-1], colours.texture, colours.textures
-            )
-        return ReadMesh(vertices, self.faces[:, ::-1], colours, self.unit, self.up)
+            colours = replace(colours, corners=colours.corners[:, ::-1], uv=colours.uv[:, ::-1])
+        return replace(self, faces=self.faces[:, ::-1], colours=colours)
+
+    def in_unit_of(self, metres: float) -> "ReadMesh":
+        """The mesh, whose unit has so many metres, in the unit of this length; in metres if it has
+        no name."""
+        for name, length in UNITS.items():
+            if abs(metres / length - 1.0) < 1e-6:
+                return replace(self, unit=name)
+        return replace(self, vertices=self.vertices * metres, unit="m")
 
     @classmethod
-    def joined(
-        cls, parts: Sequence["ReadMesh"], unit: str | None = None, up: str | None = None
-    ) -> "ReadMesh":
+    def joined(cls, parts: Sequence["ReadMesh"]) -> "ReadMesh":
         """One mesh of several, in one unit; parts without colours are white where others have
         some."""
-        if not parts:
-            return cls(np.zeros((0, 3)), np.zeros((0, 3), np.int64), None, unit, up)
-        starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
-        vertices = np.concatenate([part.vertices for part in parts])
-        faces = np.concatenate(
-            [part.faces + start for part, start in zip(parts, starts, strict=True)]
-        )
+        starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
         colours = None
         if any(part.colours is not None for part in parts):
             known = [part.colours or SurfaceColours.plain(len(part.faces)) for part in parts]
             colours = SurfaceColours.cat(known)
-        return cls(vertices, faces, colours, unit, up)
+        return cls(
+            np.concatenate([np.zeros((0, 3)), *(part.vertices for part in parts)]),
+            np.concatenate([np.zeros((0, 3), np.int64), *faces]),
+            colours,
+        )
 
 
 class MeshSource:
@@ -127,7 +132,7 @@ class MeshSource:
         self.warnings: list[MeshWarning] = []
         self._bytes_left = MAX_MESH_BYTES
         self._pixels_left = MAX_TEXTURE_PIXELS
-        self._textures: dict[object, Pixels | None] = {}
+        self._textures: dict[object, Bytes | None] = {}
         self._known_places: dict[str, list[Path]] = {}
         self._listings: dict[Path, dict[str, str]] = {}
 
@@ -142,10 +147,8 @@ class MeshSource:
         for this one."""
         other = MeshSource(path, [self.folder, *self.extra])
         other.requested = self.requested
-        other._bytes_left = self._bytes_left - path.stat().st_size
-        if other._bytes_left < 0:
-            raise ValueError(f"the files that it names hold more than {MAX_MESH_BYTES:,} bytes")
-        self._bytes_left = other._bytes_left
+        self._count_bytes(path)
+        other._bytes_left = self._bytes_left
         return other
 
     def warn(self, kind: str, text: str) -> None:
@@ -168,17 +171,15 @@ class MeshSource:
             return None
         found = next((file for file in map(self._existing, inside) if file is not None), None)
         self.requested.add(found or inside[0])
-        if len(self.requested) > MAX_MESH_PARTS:
-            raise ValueError(f"it names more than {MAX_MESH_PARTS:,} files")
+        _check_names(self.requested)
         return found or inside[0]
 
     def _places(self, name: str) -> list[Path]:
         """Where in the folders a file of a name may be, existing or not; each name is looked for
         once, and of names of strangers a bounded number."""
         if name not in self._known_places:
-            if len(self._known_places) >= MAX_MESH_PARTS:
-                raise ValueError(f"it names more than {MAX_MESH_PARTS:,} files")
             self._known_places[name] = self._places_of(name)
+            _check_names(self._known_places)
         return self._known_places[name]
 
     def _places_of(self, name: str) -> list[Path]:
@@ -208,21 +209,18 @@ class MeshSource:
             content = self._content(name)
             if content is not None:
                 return content
-        first = names[0][:100]
         if not any(map(is_file_name, names)):
-            self.warn(kind, f"{first} is no name of a file, and is left out")
+            problem = "is no name of a file, and is left out"
         elif any(self._places(name) for name in names):
-            self.warn(
-                kind, f"{first} is missing beside it; the mesh is shown without these colours"
-            )
+            problem = "is missing beside it; the mesh is shown without these colours"
         else:
-            text = f"{first} lies outside of its folder and is left out; name its folder (textures)"
-            self.warn(kind, text)
+            problem = "lies outside of its folder and is left out; name its folder (textures)"
+        self.warn(kind, f"{names[0][:100]} {problem}")
         return None
 
     def texture(
         self, key: object, read_content: Callable[[], bytes | None], name: str
-    ) -> Pixels | None:
+    ) -> Bytes | None:
         """The pixels of a picture, read and decoded once for each ``key``; None, with a warning, if
         it cannot be used."""
         if key not in self._textures:
@@ -230,11 +228,11 @@ class MeshSource:
             self._textures[key] = None if content is None else self._decoded(content, name)
         return self._textures[key]
 
-    def texture_file(self, *names: str) -> Pixels | None:
+    def texture_file(self, *names: str) -> Bytes | None:
         """The pixels of a picture that is named in one of several spellings."""
         return self.texture(names, lambda: self.read_optional("texture", *names), names[0])
 
-    def _decoded(self, content: bytes, name: str) -> Pixels | None:
+    def _decoded(self, content: bytes, name: str) -> Bytes | None:
         try:
             pixels, count = texture_pixels(content, self._pixels_left)
         except Exception as error:  # decoders raise anything
@@ -252,10 +250,13 @@ class MeshSource:
         path = self.find(name)
         if path is None or not path.is_file():
             return None
+        self._count_bytes(path)
+        return path.read_bytes()
+
+    def _count_bytes(self, path: Path) -> None:
         self._bytes_left -= path.stat().st_size
         if self._bytes_left < 0:
             raise ValueError(f"the files that it names hold more than {MAX_MESH_BYTES:,} bytes")
-        return path.read_bytes()
 
     @staticmethod
     def _relative_name(name: str) -> PurePosixPath | None:
@@ -287,13 +288,14 @@ class MeshSource:
     def _names_in(self, folder: Path) -> dict[str, str]:
         """Names of a folder by their lower case; of several the first in order."""
         if folder not in self._listings:
-            names = (
-                sorted((entry.name for entry in folder.iterdir()), reverse=True)
-                if folder.is_dir()
-                else []
-            )
+            names = sorted((path.name for path in folder.glob("*")), reverse=True)
             self._listings[folder] = {name.lower(): name for name in names}
         return self._listings[folder]
+
+
+def _check_names(names: Sized) -> None:
+    if len(names) > MAX_MESH_PARTS:
+        raise ValueError(f"it names more than {MAX_MESH_PARTS:,} files")
 
 
 def is_file_name(name: str) -> bool:
@@ -310,28 +312,23 @@ def is_file_name(name: str) -> bool:
 
 def spellings(name: bytes) -> tuple[str, ...]:
     """A file's name in the encodings that exporters write."""
-    found: list[str] = []
+    found: dict[str, None] = {}
     for encoding in ("utf-8", "gb18030", "cp1252", "latin-1"):
-        try:
-            text = name.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-        if text not in found:
-            found.append(text)
+        with suppress(UnicodeDecodeError):
+            found[name.decode(encoding)] = None
     return tuple(found)
 
 
 def plain_text(data: bytes) -> bytes:
     """A text file without byte-order mark, in an encoding that contains ASCII, with one kind of
     line end."""
-    for mark, encoding in ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
-        if data.startswith(mark):
-            data = data.decode(encoding, errors="replace").encode()
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        data = data.decode("utf-16", errors="replace").encode()
     data = data.removeprefix(b"\xef\xbb\xbf")
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
 
 
-def colour_bytes(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
+def colour_bytes(colours: Floats) -> Bytes:
     """Colours of vertices that a file writes as numbers, in 0..1 or in 0..255: whole numbers of
     which some are above 1, or numbers that mostly are, count as the latter. Beyond the range, as
     of highlights in linear colours, they are clipped; NaN is black."""
@@ -342,7 +339,7 @@ def colour_bytes(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.clip((known * (1.0 if is_in_bytes else 255.0)).round(), 0, 255).astype(np.uint8)
 
 
-def numbers(text: bytes) -> NDArray[np.float64]:
+def numbers(text: bytes) -> Floats:
     """Numbers between blanks; ValueError for anything else."""
     count = len(text.split())
     if b"," in text:
@@ -359,7 +356,15 @@ def numbers(text: bytes) -> NDArray[np.float64]:
     return values
 
 
-def as_plain_numbers(value: Any, count: int, default: Sequence[float]) -> NDArray[np.float64]:
+def finite_words(text: str, count: int) -> Floats:
+    """``count`` finite numbers between blanks."""
+    values = np.array([float(word) for word in text.split()])
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise ValueError(f"expected {count} numbers, got {text[:50]!r}")
+    return values
+
+
+def as_plain_numbers(value: Any, count: int, default: Sequence[float]) -> Floats:
     """(count,) numbers of JSON, or the default where None."""
     values = np.asarray(default if value is None else value, dtype=np.float64)
     if values.shape != (count,):

@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 
+from ...utils.arrays import Floats
 from .source import MeshSource, ReadMesh, numbers, plain_text
 
 # Bytes before the faces of a binary file, and of each face
@@ -24,7 +25,9 @@ _END = re.compile(rb"^[ \t]*+end[ \t]*+solid\b", re.MULTILINE)
 def read_stl(source: MeshSource) -> ReadMesh:
     """Read an STL file; three vertices for each face."""
     data = source.data()
-    return _binary(source, data) if _is_binary(data) else _ascii(source, plain_text(data).lower())
+    is_binary = _is_binary(data)
+    corners = _binary(source, data) if is_binary else _ascii(source, plain_text(data).lower())
+    return ReadMesh(corners, np.arange(len(corners)).reshape(-1, 3))
 
 
 def _is_binary(data: bytes) -> bool:
@@ -37,7 +40,8 @@ def _is_binary(data: bytes) -> bool:
     return not (start.lstrip().startswith(b"solid") and b"\0" not in start)
 
 
-def _binary(source: MeshSource, data: bytes) -> ReadMesh:
+def _binary(source: MeshSource, data: bytes) -> Floats:
+    """(3 F, 3) corners of the faces."""
     start = data[:_TEXT]
     if len(data) < _HEADER or (start.isascii() and b"\0" not in start):
         raise ValueError("the file ends too early, or is no STL file")
@@ -52,14 +56,12 @@ def _binary(source: MeshSource, data: bytes) -> ReadMesh:
             "cut", f"it says {claimed:,} faces and holds {whole:,}: the others are left out"
         )
     records = np.frombuffer(data, _RECORD, claimed, _HEADER)
-    vertices = records["corners"].reshape(-1, 3).astype(np.float64)
-    return ReadMesh(vertices, np.arange(len(vertices)).reshape(-1, 3))
+    return np.asarray(records["corners"].reshape(-1, 3), np.float64)
 
 
-def _ascii(source: MeshSource, text: bytes) -> ReadMesh:
+def _ascii(source: MeshSource, text: bytes) -> Floats:
     lines = _VERTEX.findall(text)
-    if any(b"," in line for line in lines):
-        raise ValueError("decimal commas; export it with decimal points")
+    values = numbers(b"\n".join(lines))
     facets = len(_FACET.findall(text))
     if len(lines) != 3 * facets or len(_END_OF_FACET.findall(text)) != facets:
         raise ValueError(
@@ -70,8 +72,6 @@ def _ascii(source: MeshSource, text: bytes) -> ReadMesh:
         source.warn(
             "cut", "it does not end with endsolid: it may have been cut short, and lack faces"
         )
-    values = numbers(b"\n".join(lines))
     if len(values) != 9 * facets:
         raise ValueError("a vertex does not have three coordinates")
-    vertices = values.reshape(-1, 3)
-    return ReadMesh(vertices, np.arange(len(vertices)).reshape(-1, 3))
+    return values.reshape(-1, 3)

@@ -5,20 +5,22 @@ trimesh 5.2 reads shapes and places, and no colours, supports or units; it needs
 those, and bounds what an archive unpacks to, this reader can go.
 """
 
+import re
 import xml.parsers.expat
 import zipfile
 from array import array
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import MAX_MESH_BYTES, MAX_MESH_FACES, MAX_MESH_PARTS
+from ...utils.arrays import Bytes, Floats
 from ..xml_files import check_xml
-from .colours import SurfaceColours
-from .source import MeshSource, Pixels, ReadMesh
+from .colours import Painting, SurfaceColours
+from .limits import check_faces, check_parts
+from .source import MeshSource, ReadMesh, finite_words
 
 _UNITS = {"millimeter": "mm", "centimeter": "cm", "inch": "in", "foot": "ft", "meter": "m"}
 _MICRON = "micron"
@@ -52,7 +54,7 @@ class _Object:
     vertices: "array[float]" = field(default_factory=lambda: array("d"))
     triangles: "array[int]" = field(default_factory=lambda: array("q"))
     properties: list[tuple[str, int, int, int] | None] = field(default_factory=list)
-    components: list[tuple[str, str, str]] = field(default_factory=list)
+    components: list[Item] = field(default_factory=list)
 
 
 @dataclass
@@ -66,7 +68,6 @@ class _Model:
     coordinates: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     texture_of: dict[str, str] = field(default_factory=dict)
     paths: dict[str, str] = field(default_factory=dict)
-    lost: set[str] = field(default_factory=set)
     unread: set[str] = field(default_factory=set)
 
 
@@ -83,10 +84,10 @@ def read_threemf(source: MeshSource) -> ReadMesh:
     parts = []
     for path, name, transform in package.items(root):
         parts += package.parts(path, name, _matrix(transform), 0)
-    mesh = ReadMesh.joined(parts)
+    mesh = replace(ReadMesh.joined(parts), up="z")
     if model.unit == _MICRON:
-        return ReadMesh(mesh.vertices * 1e-3, mesh.faces, mesh.colours, "mm", "z")
-    return ReadMesh(mesh.vertices, mesh.faces, mesh.colours, _UNITS[model.unit], "z")
+        return replace(mesh, vertices=mesh.vertices * 1e-3, unit="mm")
+    return replace(mesh, unit=_UNITS[model.unit])
 
 
 class _Package:
@@ -98,8 +99,8 @@ class _Package:
         self._archive = zipfile.ZipFile(BytesIO(source.data()))
         self._names = {name.lower(): name for name in self._archive.namelist()}
         self._bytes_left = MAX_MESH_BYTES
-        self._faces_left = MAX_MESH_FACES
-        self._parts_left = MAX_MESH_PARTS
+        self._faces = 0
+        self._parts = 0
         self._models: dict[str, _Model] = {}
         self._meshes: dict[tuple[str, str], ReadMesh] = {}
 
@@ -142,23 +143,21 @@ class _Package:
             self._source.warn("parts", f"{text} lie: if they are loose, export one of them")
         return list(items.values())
 
-    def parts(self, path: str, name: str, place: NDArray[np.float64], depth: int) -> list[ReadMesh]:
+    def parts(self, path: str, name: str, place: Floats, depth: int) -> list[ReadMesh]:
         """The meshes of an object and of its components, at their places."""
         model = self.model(path)
         if name not in model.objects:
             raise ValueError(f"it names object {name[:50]}, which it lacks")
         if depth > 50:
             raise ValueError("its components form a circle")
-        self._parts_left -= 1
-        if self._parts_left < 0:
-            raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
+        self._parts += 1
+        check_parts(self._parts)
         found = []
         one = model.objects[name]
         if one.triangles:
             mesh = self._mesh(path, name)
-            self._faces_left -= len(mesh.faces)
-            if self._faces_left < 0:
-                raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
+            self._faces += len(mesh.faces)
+            check_faces(self._faces)
             found.append(mesh.transformed(place))
         for other, child, transform in one.components:
             found += self.parts(other or path, child, place @ _matrix(transform), depth + 1)
@@ -179,37 +178,33 @@ class _Package:
 
     def _colours(self, model: _Model, one: _Object) -> SurfaceColours | None:
         default = (one.group, one.index, one.index, one.index) if one.group else None
-        rows = [found or default for found in one.properties]
-        if not any(rows):
+        rows_of: dict[str, list[list[int]]] = {}
+        for row, found in enumerate(one.properties):
+            if (entry := found or default) is not None:
+                group, *indices = entry
+                rows_of.setdefault(group, []).append([row, *indices])
+        if not rows_of:
             return None
-        plain = SurfaceColours.plain(len(rows))
-        corners = plain.corners.copy()
-        uv = plain.uv.copy()
-        texture = plain.texture.copy()
-        pixels: list[Pixels] = []
-        number: dict[str, int] = {}
-        for row, found in enumerate(rows):
-            if found is None:
-                continue
-            group, *indices = found
+        painting = Painting(len(one.properties))
+        for group, table in rows_of.items():
+            entries = np.array(table)
+            rows = entries[:, 0]
+            corners = entries[:, 1:]
             if group in model.colours:
-                corners[row] = [model.colours[group][index] for index in indices]
+                painting.corners[rows] = np.array(model.colours[group])[corners]
             elif group in model.coordinates:
-                if group not in number:
-                    picture = self._texture(model, group)
-                    number[group] = -1 if picture is None else len(pixels)
-                    pixels += [] if picture is None else [picture]
-                uv[row] = [model.coordinates[group][index] for index in indices]
-                texture[row] = number[group]
-            elif group not in model.lost:
-                model.lost.add(group)
+                texture = self._texture(model, group)
+                if texture is not None:
+                    uv = np.array(model.coordinates[group])[corners]
+                    painting.add_texture(rows, texture, uv)
+            else:
                 self._source.warn(
                     "material",
                     "it has materials of a kind that is not read; they are shown in white",
                 )
-        return SurfaceColours(corners, np.nan_to_num(uv), texture, tuple(pixels))
+        return painting.finished()
 
-    def _texture(self, model: _Model, group: str) -> Pixels | None:
+    def _texture(self, model: _Model, group: str) -> Bytes | None:
         path = model.paths.get(model.texture_of.get(group, ""), "")
 
         def read_content() -> bytes | None:
@@ -232,15 +227,11 @@ class _Package:
         return content
 
 
-def _matrix(text: str) -> NDArray[np.float64]:
+def _matrix(text: str) -> Floats:
     """(4, 4) of the 12 numbers of a transform, which 3MF writes for row vectors."""
-    if not text:
-        return np.eye(4)
-    values = np.array([float(word) for word in text.split()])
-    if values.shape != (12,) or not np.isfinite(values).all():
-        raise ValueError("a transform does not have 12 numbers")
     T = np.eye(4)
-    T[:3] = values.reshape(4, 3).T
+    if text:
+        T[:3] = finite_words(text, 12).reshape(4, 3).T
     return T
 
 
@@ -268,16 +259,11 @@ def _parsed(data: bytes) -> _Model:
             current = model.objects[plain["id"]] = _Object(
                 plain.get("pid", ""), int(plain.get("pindex", 0)), plain.get("type", "model")
             )
-        elif kind == "component":
-            current.components.append(
-                (plain.get("path", ""), plain["objectid"], plain.get("transform", ""))
-            )
-        elif kind == "item":
-            item = plain.get("path", ""), plain["objectid"], plain.get("transform", "")
-            if plain.get("printable", "1") in ("0", "false"):
-                model.unread.add("items that are not printed")
-            else:
-                model.items.append(item)
+        elif kind == "item" and plain.get("printable", "1") in ("0", "false"):
+            model.unread.add("items that are not printed")
+        elif kind in ("component", "item"):
+            copies = model.items if kind == "item" else current.components
+            copies.append((plain.get("path", ""), plain["objectid"], plain.get("transform", "")))
         elif kind == "model":
             model.unit = plain.get("unit", "millimeter")
             if model.unit not in (*_UNITS, _MICRON):
@@ -311,9 +297,7 @@ def _property(attributes: Attributes, current: _Object) -> tuple[str, int, int, 
     """The group of properties of a triangle, and the entries of its corners."""
     if "p1" not in attributes:
         return None
-    first = int(attributes["p1"])
-    second = int(attributes.get("p2", first))
-    third = int(attributes.get("p3", first))
+    first, second, third = (int(attributes.get(k, attributes["p1"])) for k in ("p1", "p2", "p3"))
     if min(first, second, third) < 0:
         raise IndexError
     return attributes.get("pid", current.group), first, second, third
@@ -321,8 +305,7 @@ def _property(attributes: Attributes, current: _Object) -> tuple[str, int, int, 
 
 def _colour(text: str) -> tuple[int, int, int]:
     """#RRGGBB or #RRGGBBAA; white for anything else."""
-    try:
-        value = bytes.fromhex(text.removeprefix("#")[:6])
-    except ValueError:
-        value = b""
-    return (value[0], value[1], value[2]) if len(value) == 3 else (255, 255, 255)
+    found = re.match(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", text)
+    if found is None:
+        return 255, 255, 255
+    return int(found[1], 16), int(found[2], 16), int(found[3], 16)

@@ -5,8 +5,6 @@ yourdfpy reads the same tree of joints. It would replace some 60 lines here, not
 meshes, their bounds and colours, and would bring lxml as another dependency.
 """
 
-import math
-import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +12,15 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from trimesh.transformations import euler_matrix
 
-from ...errors import MAX_MESH_FACES, MAX_MESH_PARTS, MAX_TABLE_BYTES, MeshError
+from ...errors import MAX_TABLE_BYTES, MeshError
+from ...utils.arrays import Bytes, Floats
 from ...utils.choices import UNITS
-from ..xml_files import check_elements, check_xml
-from .colours import SurfaceColours
-from .source import MeshSource, ReadMesh, is_file_name
+from ..xml_files import read_xml
+from .colours import SurfaceColours, byte_colours
+from .limits import check_faces, check_parts
+from .source import MeshSource, ReadMesh, finite_words, is_file_name
 
 _URDF_FOLDERS = ("robots", "urdf")  # of ROS packages, beside their meshes
 ReadPart = Callable[[MeshSource], ReadMesh]
@@ -31,10 +31,7 @@ def read_urdf(source: MeshSource, read_part: ReadPart, link: str | None = None) 
     is up."""
     if source.path.stat().st_size > MAX_TABLE_BYTES:
         raise ValueError(f"larger than {MAX_TABLE_BYTES:,} bytes")
-    data = source.data()
-    check_xml(data)
-    check_elements(data)
-    robot = ET.fromstring(data)
+    robot = read_xml(source.data())
     if robot.tag != "robot":
         raise ValueError(
             "no robot in it; of a xacro file, write the URDF first (xacro FILE > robot.urdf)"
@@ -51,19 +48,19 @@ def read_urdf(source: MeshSource, read_part: ReadPart, link: str | None = None) 
             f"the meshes that it names are missing in its folder ({reader.missing[0][:100]}); name "
             f"their folder (textures)"
         )
-    return ReadMesh.joined(parts, "m", "z")
+    return replace(ReadMesh.joined(parts), unit="m", up="z")
 
 
-def _places(robot: Any, links: dict[str, Any]) -> dict[str, NDArray[np.float64]]:
+def _places(robot: Any, links: dict[str, Any]) -> dict[str, Floats]:
     """The place of each link in the root's frame, all joints at zero."""
-    above: dict[str, tuple[str, NDArray[np.float64]]] = {}
+    above: dict[str, tuple[str, Floats]] = {}
     for joint in robot.findall("joint"):
         parent = joint.find("parent")
         child = joint.find("child")
         if parent is None or child is None:
             raise ValueError("a joint without parent or child")
         above[str(child.get("link"))] = (str(parent.get("link")), _origin(joint))
-    places: dict[str, NDArray[np.float64]] = {}
+    places: dict[str, Floats] = {}
     for name in links:
         chain = [name]
         while chain[-1] not in places and chain[-1] in above:
@@ -77,49 +74,29 @@ def _places(robot: Any, links: dict[str, Any]) -> dict[str, NDArray[np.float64]]
     return {name: places[name] for name in links}
 
 
-def _origin(element: Any) -> NDArray[np.float64]:
+def _origin(element: Any) -> Floats:
     """(4, 4) of an ``origin``: roll, pitch and yaw about fixed axes, and a translation."""
     origin = element.find("origin")
-    T = np.eye(4)
     if origin is None:
-        return T
-    roll, pitch, yaw = _numbers(origin.get("rpy", "0 0 0"), 3)
-    T[:3, :3] = _turn(yaw, 2) @ _turn(pitch, 1) @ _turn(roll, 0)
-    T[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), 3)
+        return np.eye(4)
+    T = np.asarray(euler_matrix(*finite_words(origin.get("rpy", "0 0 0"), 3)))
+    T[:3, 3] = finite_words(origin.get("xyz", "0 0 0"), 3)
     return T
 
 
-def _turn(angle: float, axis: int) -> NDArray[np.float64]:
-    first = (axis + 1) % 3
-    second = (axis + 2) % 3
-    R = np.eye(3)
-    R[first, first] = R[second, second] = math.cos(angle)
-    R[first, second] = -math.sin(angle)
-    R[second, first] = math.sin(angle)
-    return R
-
-
-def _numbers(text: str, count: int) -> NDArray[np.float64]:
-    values = np.array([float(word) for word in text.split()])
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise ValueError(f"expected {count} numbers, got {text[:50]!r}")
-    return values
-
-
-def _colour(material: Any) -> NDArray[np.uint8] | None:
+def _colour(material: Any) -> Bytes | None:
     """(3,) of a material's ``color``, None without one."""
     colour = material.find("color")
     if colour is None:
         return None
-    rgba = _numbers(colour.get("rgba", "1 1 1 1"), 4)
-    return np.asarray(np.round(255.0 * np.clip(rgba[:3], 0.0, 1.0)), np.uint8)
+    return byte_colours(finite_words(colour.get("rgba", "1 1 1 1"), 4)[:3])
 
 
 class _Parts:
     """The visible parts of links; each mesh file is read once."""
 
     def __init__(
-        self, source: MeshSource, read_part: ReadPart, colours: dict[str, NDArray[np.uint8] | None]
+        self, source: MeshSource, read_part: ReadPart, colours: dict[str, Bytes | None]
     ) -> None:
         self._source = source
         self._read_part = read_part
@@ -127,32 +104,28 @@ class _Parts:
         self._meshes: dict[Path, ReadMesh] = {}
         self._paths: dict[str, Path | None] = {}
         self.missing: list[str] = []
-        self._faces_left = MAX_MESH_FACES
-        self._parts_left = MAX_MESH_PARTS
+        self._faces = 0
+        self._visuals = 0
 
-    def of_link(self, link: Any, place: NDArray[np.float64]) -> list[ReadMesh]:
+    def of_link(self, link: Any, place: Floats) -> list[ReadMesh]:
         """The visible parts of a link that lies at ``place``."""
         found = []
         for visual in link.findall("visual"):
-            self._parts_left -= 1
+            self._visuals += 1
+            check_parts(self._visuals)
             geometry = visual.find("geometry")
-            has_room = self._parts_left >= 0
-            mesh = self._mesh(geometry) if has_room and geometry is not None else None
-            self._faces_left -= 0 if mesh is None else len(mesh.faces)
-            if not has_room or self._faces_left < 0:
-                raise ValueError(
-                    f"more than {MAX_MESH_PARTS:,} parts or {MAX_MESH_FACES:,} faces; leave some "
-                    f"out"
-                )
+            mesh = None if geometry is None else self._mesh(geometry)
             if mesh is None:
                 continue
+            self._faces += len(mesh.faces)
+            check_faces(self._faces)
             colour = self._colour_of(visual)
             if mesh.colours is None and colour is not None:
                 mesh = replace(mesh, colours=SurfaceColours.plain(len(mesh.faces), colour))
             found.append(mesh.transformed(place @ _origin(visual)))
         return found
 
-    def _colour_of(self, visual: Any) -> NDArray[np.uint8] | None:
+    def _colour_of(self, visual: Any) -> Bytes | None:
         material = visual.find("material")
         if material is None:
             return None
@@ -165,12 +138,12 @@ class _Parts:
             if shape.tag == "mesh":
                 return self._file(shape)
             if shape.tag == "box":
-                return _of_trimesh(trimesh.creation.box(_numbers(shape.get("size", ""), 3)))
-            radius = float(_numbers(shape.get("radius", ""), 1)[0])
+                return _of_trimesh(trimesh.creation.box(finite_words(shape.get("size", ""), 3)))
+            radius = float(finite_words(shape.get("radius", ""), 1)[0])
             if shape.tag == "sphere":
                 return _of_trimesh(trimesh.creation.icosphere(4, radius))
             if shape.tag == "cylinder":
-                length = float(_numbers(shape.get("length", ""), 1)[0])
+                length = float(finite_words(shape.get("length", ""), 1)[0])
                 return _of_trimesh(trimesh.creation.cylinder(radius, length, sections=64))
         return None
 
@@ -197,7 +170,7 @@ class _Parts:
             self._meshes[path] = replace(mesh, vertices=mesh.vertices * UNITS[mesh.unit or "m"])
         mesh = self._meshes[path]
         T = np.eye(4)
-        T[:3, :3] *= _numbers(shape.get("scale", "1 1 1"), 3)
+        T[:3, :3] *= finite_words(shape.get("scale", "1 1 1"), 3)
         return mesh.transformed(T)
 
     def _find(self, name: str) -> Path | None:

@@ -5,11 +5,11 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import (
     MAX_CAD_MEMORY,
@@ -19,24 +19,22 @@ from ...errors import (
     MAX_MESH_FACES,
     MAX_MESH_PARTS,
 )
-from ...utils.choices import UNITS
-from ...utils.extras import check_extras
+from ...utils.arrays import Array, Bytes, Integers
 from ...utils.programs import run_program
 from ...utils.srgb import srgb
 from .cad import bounded
-from .colours import SurfaceColours
+from .colours import Painting, SurfaceColours, byte_colours
 from .polygons import triangles_of_faces
-from .source import MeshSource, Pixels, ReadMesh
+from .source import MeshSource, ReadMesh
 
 _PROGRAM = Path(__file__).with_name("usd_parts.py")
 FALLBACK_UNIT = "cm"  # OpenUSD's, of a stage that states no metersPerUnit
-Arrays = Mapping[str, NDArray[Any]]
+Arrays = Mapping[str, Array]
 
 
 def read_usd(source: MeshSource) -> ReadMesh:
     """Read a USD or USDZ file at its first frame, in its own unit and axes; surfaces that are
     subdivided are taken as they are stored."""
-    check_extras([source.path])
     bounded(source)
     about, arrays = _parts_of(source.path.resolve())
     for name in about["layers"]:
@@ -45,19 +43,8 @@ def read_usd(source: MeshSource) -> ReadMesh:
         kinds = ", ".join(about["left_out"])
         source.warn("parts", f"parts that are no meshes are left out ({kinds}); export meshes")
     parts = [_part(source, f"{k}.", part, arrays) for k, part in enumerate(about["parts"])]
-    unit, factor = _unit(about["metres"])
-    mesh = ReadMesh.joined(parts)
-    vertices = mesh.vertices * factor
-    return ReadMesh(vertices, mesh.faces, mesh.colours, unit, about["up"], FALLBACK_UNIT)
-
-
-def _unit(metres: float | None) -> tuple[str | None, float]:
-    """The unit of a length in metres and 1; metres and a factor, if it has no name; None of an
-    unknown one."""
-    if metres is None:
-        return None, 1.0
-    named = [name for name, length in UNITS.items() if abs(metres / length - 1.0) < 1e-6]
-    return (named[0], 1.0) if named else ("m", metres)
+    mesh = replace(ReadMesh.joined(parts), up=about["up"], usual_unit=FALLBACK_UNIT)
+    return mesh if about["metres"] is None else mesh.in_unit_of(about["metres"])
 
 
 def _parts_of(path: Path) -> tuple[dict[str, Any], Arrays]:
@@ -92,16 +79,14 @@ def _part(source: MeshSource, key: str, part: dict[str, Any], arrays: Arrays) ->
     starts = np.cumsum(counts) - counts
     material = arrays[key + "material"]
     kept = (material >= 0) & (counts > 2)
-    corners = [np.arange(s, s + n) for s, n in zip(starts[kept], counts[kept], strict=True)]
     indices = arrays[key + "indices"]
-    polygons = [indices[one].tolist() for one in corners]
+    spans = zip(starts[kept], counts[kept], strict=True)
+    polygons = [indices[start : start + count].tolist() for start, count in spans]
     faces, owner, places = triangles_of_faces(vertices, polygons)
     corner = starts[kept][owner][:, None] + places
-    if part["left_handed"]:
-        faces = faces[:, ::-1]
-        corner = corner[:, ::-1]
     colours = _colours(source, key, part, arrays, corner, material[kept][owner])
     mesh = ReadMesh(vertices, faces, colours)
+    mesh = mesh.turned_over() if part["left_handed"] else mesh
     return mesh.transformed(np.array(part["place"]))
 
 
@@ -110,49 +95,38 @@ def _colours(
     key: str,
     part: dict[str, Any],
     arrays: Arrays,
-    corner: NDArray[np.int64],
-    material: NDArray[np.int64],
+    corner: Integers,
+    material: Integers,
 ) -> SurfaceColours | None:
     """Colours of faces by their material, where they have one, else those of the mesh."""
     own = arrays.get(key + "colour")
     if own is None and not part["materials"]:
         return None
-    plain = SurfaceColours.plain(len(corner))
-    tint = np.array(plain.corners)
-    uv = plain.uv.copy()
-    texture = plain.texture.copy()
-    textures: list[Pixels] = []
+    painting = Painting(len(corner))
     if own is not None:
-        tint = _bytes(own[corner])
-    for number, surface in enumerate(part["materials"], start=1):
-        faces = material == number
+        painting.corners = byte_colours(srgb(own[corner]))
+    for number, surface in enumerate(part["materials"]):
+        faces = material == number + 1
         if "colour" in surface:
-            tint[faces] = _bytes(np.array(surface["colour"]))
+            painting.corners[faces] = byte_colours(srgb(np.array(surface["colour"])))
         if surface.get("unread"):
             source.warn("texture", "a texture is made in a way that is not read; it is left out")
-        pixels = _texture(source, surface) if "texture" in surface else None
-        if pixels is not None:
-            tint[faces] = _tint(source, surface)
-            coordinates = np.nan_to_num(arrays[f"{key}uv{number - 1}"], posinf=0.0, neginf=0.0)
-            uv[faces] = coordinates[corner[faces]]
-            texture[faces] = len(textures)
-            textures.append(pixels)
-    return SurfaceColours(tint, uv, texture, tuple(textures))
+        texture = _texture(source, surface) if "texture" in surface else None
+        if texture is not None:
+            painting.corners[faces] = _tint(source, surface)
+            painting.add_texture(faces, texture, arrays[f"{key}uv{number}"][corner[faces]])
+    return painting.finished()
 
 
-def _tint(source: MeshSource, surface: dict[str, Any]) -> NDArray[np.uint8]:
+def _tint(source: MeshSource, surface: dict[str, Any]) -> Bytes:
     """(3,) what the colours of a texture are multiplied by."""
     scale = np.array(surface.get("scale", (1.0, 1.0, 1.0)))
     if scale.max() > 1.0 or any(surface.get("bias", ())):
         source.warn("texture", "a texture is made brighter by scale or bias: read without")
-    return _bytes(scale)
+    return byte_colours(srgb(scale))
 
 
-def _bytes(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
-    return np.round(255.0 * srgb(linear)).astype(np.uint8)
-
-
-def _texture(source: MeshSource, surface: dict[str, Any]) -> Pixels | None:
+def _texture(source: MeshSource, surface: dict[str, Any]) -> Bytes | None:
     """The pixels of a texture: a file beside the mesh, or in a package."""
     name = str(surface["texture"])
     inner = str(surface["inner"])

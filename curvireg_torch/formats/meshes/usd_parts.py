@@ -18,7 +18,6 @@ from pxr import Ar, Sdf, Usd, UsdGeom, UsdShade
 MAX_PRIMS_PER_PART = 20  # groups, materials and lights beside the parts
 MAX_LAYERS = 1000
 COLOUR_NAMES = ("diffuseColor", "baseColor", "base_color")
-COORDINATES = ("TexCoord2fArray", "Float2Array")
 
 
 def main() -> None:

@@ -524,8 +524,8 @@ def test_hostile_urdf_files_are_refused(tmp_path, monkeypatch):
         with pytest.raises(MeshError, match=match):
             cr.load_mesh(path)
     path.write_text(text)
-    monkeypatch.setattr("curvireg_torch.formats.meshes.urdf.MAX_MESH_FACES", 20)
-    with pytest.raises(MeshError, match="faces; leave some out"):
+    monkeypatch.setattr("curvireg_torch.formats.meshes.limits.MAX_MESH_FACES", 20)
+    with pytest.raises(MeshError, match="more than 20 faces"):
         cr.load_mesh(path)
 
 

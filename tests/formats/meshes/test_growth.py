@@ -14,8 +14,9 @@ from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
-from curvireg_torch.formats.meshes import cad, colours, files, gltf, source, threemf, usd
+from curvireg_torch.formats.meshes import cad, colours, files, gltf, limits, source, threemf, usd
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, is_file_name
+from curvireg_torch.formats.xml_files import read_xml
 from curvireg_torch.utils.extras import is_installed
 from curvireg_torch.utils.programs import run_program
 from tests.formats.meshes.step import step_file
@@ -68,7 +69,7 @@ def test_names_of_urdf_are_looked_for_by_a_bounded_number_of_ends(tmp_path, monk
     assert twice < 30
     visuals = [f'<mesh filename="package://{k}/b.stl"/>' for k in range(60)]
     path = robot(tmp_path / "a.urdf", *visuals)
-    monkeypatch.setattr("curvireg_torch.formats.meshes.urdf.MAX_MESH_PARTS", 50)
+    monkeypatch.setattr("curvireg_torch.formats.meshes.limits.MAX_MESH_PARTS", 50)
     with pytest.raises(MeshError, match="more than 50 parts"):
         cr.load_mesh(path)
 
@@ -302,11 +303,11 @@ def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(tmp_path, mon
     for more in (copies, '<instance_controller url="#c"/>' * 4):
         with_more = collada(more=more).replace("<library_nodes>", f"{skin}<library_nodes>")
         path.write_text(with_more)
-        monkeypatch.setattr(cad, "MAX_MESH_FACES", 4)
+        monkeypatch.setattr(limits, "MAX_MESH_FACES", 4)
         with pytest.raises(MeshError, match="more than 4 faces"):
             cr.load_mesh(path)
-        monkeypatch.setattr(cad, "MAX_MESH_FACES", 5)
-        cad._check_copies(cad.ET.fromstring(with_more))
+        monkeypatch.setattr(limits, "MAX_MESH_FACES", 5)
+        cad._check_copies(read_xml(with_more.encode()))
     monkeypatch.setattr("curvireg_torch.formats.xml_files.MAX_XML_ELEMENTS", 20)
     with pytest.raises(MeshError, match="more than 20 elements of XML"):
         cr.load_mesh(path)

@@ -16,7 +16,7 @@ from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
-from curvireg_torch.formats.meshes import colours, gltf, polygons, source
+from curvireg_torch.formats.meshes import colours, limits, polygons, source
 from curvireg_torch.mesh import mesh as mesh_module
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
@@ -199,7 +199,7 @@ def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path, monkeypatc
     monkeypatch.setattr(mesh_module, "MAX_MESH_FACES", 1000)
     refused(tmp_path / "a.stl", content, "1,280 faces")
     copies = json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode()
-    monkeypatch.setattr(gltf, "MAX_MESH_FACES", 100)
+    monkeypatch.setattr(limits, "MAX_MESH_FACES", 100)
     refused(tmp_path / "a.gltf", copies, "more than 100 faces")
     monkeypatch.setattr(source, "MAX_MESH_BYTES", 1000)
     refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
@@ -236,10 +236,9 @@ def test_divide_faces_counts_before_it_divides(tmp_path, monkeypatch):
         assert len(cr.load_mesh(tmp_path / name).faces) == 20
         monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 159)
         refused(tmp_path / name, content, "not convex have too many corners")
-        monkeypatch.setattr(polygons, "MAX_MESH_FACES", 19)
+        monkeypatch.setattr(limits, "MAX_MESH_FACES", 19)
         refused(tmp_path / name, content, "more than 19 faces")
-        for reader in ("files", "obj", "ply"):
-            monkeypatch.setattr(f"curvireg_torch.formats.meshes.{reader}.MAX_MESH_LINES", 9)
+        monkeypatch.setattr(limits, "MAX_MESH_LINES", 9)
         refused(tmp_path / name, content, "more than 9 lines")
     monkeypatch.undo()
     monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 160)
