@@ -37,24 +37,24 @@ from scripts.paper.measures import (
     points_within,
     repeatability,
 )
+from scripts.paper.tables import (
+    CURVE_OFFSETS,
+    PHOTOS,
+    RANKS,
+    REFINED_PAIRS,
+    REPEATED_DEPTHS,
+    RIGHT_DEG,
+    SEARCHED_PAIRS,
+)
 
 Record = dict[str, Any]
 
-PHOTOS = ("MFC", "MCS", "IG")
 DEPTHS = ("CS", "ASG", "AR")
-PAIRS = tuple(f"{depth}/{photo}" for depth in DEPTHS for photo in PHOTOS)
-REPEATED_DEPTHS = ("CS", "ASG", "HFN")
-# degrees about the object's z axis: 40 views, the true one among them
-CURVE_OFFSETS = tuple(range(-100, 100, 5))
 CURVE_DETECTORS = ("MFC", "MCS", "IG", "SIFT", "SOBEL")
 SENSITIVE = ("MFC", "MCS", "IG", "SOBEL", "CANNY")
 EPS = (1.0, 2.0, 3.0, 4.0)
 SHARES = (0.01, 0.02, 0.04, 0.08)
-RANKS = (1, 3, 5, 10, 20)
 BEST_PAIR = "CS/MFC"
-SEARCHED_PAIRS = PAIRS[:3]
-REFINED_PAIRS = ("CS/MFC", "CS/MCS")
-RIGHT_DEG = 30.0
 KNOWN_AZIMUTH_DEG = 45.0
 FOCUS_BATCH = 16  # photographs
 THRESHOLDS = (0.001, PAPER_THRESHOLD, 0.01, 0.03, 0.06, 0.1)

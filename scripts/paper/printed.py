@@ -106,6 +106,5 @@ PRECISION = _means(_PRECISION, PAIRS)
 """Means over the classes that the paper prints; of the web collection, over its objects."""
 
 IP_BY_CLASS = _by_class(_IP, CLASSES, DETECTORS, 0.01)
-HAUSDORFF_BY_CLASS = _by_class(_HAUSDORFF, CLASSES, DETECTORS)
 PRECISION_BY_CLASS = _by_class(_PRECISION, PRECISION_CLASSES, PAIRS)
 """What the paper prints for each class."""

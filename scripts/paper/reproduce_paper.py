@@ -1,4 +1,4 @@
-"""Measure the paper's tables and figures on a dataset, as CSV, Markdown and pictures.
+"""Measure the paper's tables and figures on a dataset, as Markdown and a picture.
 
     pip install 'curvireg_torch[paper]'
     python scripts/paper/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR [--jobs N] [--page
@@ -43,17 +43,16 @@ from curvireg_torch.errors import CurviregError, InvalidInputError, MissingDepen
 from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.pipeline import BankSettings
-from curvireg_torch.utils.files import file_digest, text_digest
+from curvireg_torch.utils.files import file_digest, text_digest, write_file
 from scripts._shared import commit
 from scripts.paper import tables as paper
 from scripts.paper.cases import Case, by_mesh, find_cases
 from scripts.paper.parts import Part, complete, read
 
-CURVE_OFFSETS = range(-100, 100, 5)
 OF_POINTS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
     "detectors": paper.detector_tables,
     "repeatability": paper.repeatability_tables,
-    "curve": lambda records: paper.curve_tables(records, CURVE_OFFSETS),
+    "curve": paper.curve_tables,
     "sensitivity": paper.sensitivity_tables,
 }
 OF_VIEWS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
@@ -112,9 +111,9 @@ def run(arguments: argparse.Namespace) -> None:
             )
         for name in chosen:
             for table in makers[name](paper.Records(records, what)):
-                table.write(arguments.out)
-                if table.name in (*ON_PAGE, *OF_FOCUS_PAGE):
-                    print(table.markdown(), flush=True)
+                text = table.markdown()
+                write_file(arguments.out / f"{table.name}.md", text.encode())
+                print(text, flush=True)
             if name == "curve":
                 draw_curve(records, arguments.out / "curve.png")
     if arguments.page is not None:
@@ -178,8 +177,10 @@ def draw_curve(records: list[dict[str, Any]], path: Path) -> None:
     axes = figure.subplots()
     every = paper.Records(records, "")
     for name in records[0]["curve"]:
-        means = [every.mean(paper.at("curve", name, k)).mean for k in range(len(CURVE_OFFSETS))]
-        axes.plot(CURVE_OFFSETS, means, label=name)
+        means = [
+            every.mean(paper.at("curve", name, k)).mean for k in range(len(paper.CURVE_OFFSETS))
+        ]
+        axes.plot(paper.CURVE_OFFSETS, means, label=name)
     axes.set_xlabel("degrees about z from the true view")
     axes.set_ylabel("repeatability")
     axes.legend(fontsize=7)

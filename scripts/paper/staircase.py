@@ -1,5 +1,4 @@
-"""From the letter of the paper to the default pipeline, one change at a time; and what each part of
-the default is worth.
+"""From the letter of the paper to the default pipeline, one change at a time.
 
     python scripts/paper/staircase.py pascal3d=/data/pascal3d_mini lm=/data/bop/lm --out DIR
     [--limit N] [--jobs N] [--page PAGE]
@@ -9,9 +8,6 @@ are cumulative, each has the results of ``curvireg evaluate``, and a second call
 missing: DIR/NAME holds one file for each mesh, DIR/staircase.csv one row for each set and step. All
 steps of a mesh are measured together, so that it is opened once. --page writes the table into a
 page of the documentation, between its markers.
-
-``--table parts`` measures the default without each of its parts instead, and the other presets, as
-DIR/parts.csv.
 """
 
 import argparse
@@ -104,27 +100,6 @@ def pipelines(pose: str) -> Iterator[tuple[str, Pipeline]]:
         yield f"{k}. {step.name}", pipeline
 
 
-def parts(pose: str) -> Iterator[tuple[str, Pipeline]]:
-    """The default, the same without each of its parts, and other presets."""
-    default = Pipeline().with_pose_prior(pose)
-    classical = PRESETS["classical"].with_pose_prior(pose)
-    yield "learned: the default", default
-    yield "without the contour fit", replace(default, hypotheses=1, contours=False)
-    yield "without the appearance term", default.with_term("appearance", weight=0)
-    yield "without repeatability", default.with_term("repeatability", weight=0)
-    yield "without the box's shape", default.with_term("box", weight=0)
-    yield "without box jitter", replace(default, box_jitter=0.0)
-    yield "fast", PRESETS["fast"].with_pose_prior(pose)
-    yield "classical", classical
-    yield "gradient instead of focus curves", replace(classical, field="gradient")
-    yield "paper", PRESETS["paper"]
-
-
-LADDERS = {"staircase": pipelines, "parts": parts}
-HEADERS = {"staircase": "change", "parts": "pipeline"}
-TEXTS = {"staircase": "; each line adds one change to the line above", "parts": ""}
-
-
 def benchmark_of(root: Path, pixel_origin: int) -> Benchmark:
     """The objects of a PASCAL3D+ release or a BOP set under the usual protocol."""
     if (root / "CAD").is_dir():
@@ -207,12 +182,10 @@ class Climber:
         return self.bank
 
 
-def measure(
-    ladder: str, root: Path, pixel_origin: int, chosen: list[int], steps: list[int]
-) -> dict[str, Any]:
+def measure(root: Path, pixel_origin: int, chosen: list[int], steps: list[int]) -> dict[str, Any]:
     """Errors of some objects of one mesh after each of some steps."""
     benchmark = benchmark_of(root, pixel_origin)
-    every = [pipeline for _, pipeline in LADDERS[ladder](benchmark.protocol.pose)]
+    every = [pipeline for _, pipeline in pipelines(benchmark.protocol.pose)]
     start = time.process_time()
     errors: dict[str, list[float]] = {str(k): [] for k in steps}
     seconds: dict[str, float] = {}
@@ -233,7 +206,7 @@ def climb(name: str, root: Path, options: argparse.Namespace) -> None:
     """Measure the steps of one set, and record them when all of its meshes are done."""
     benchmark = benchmark_of(root, options.pixel_origin)
     groups = chosen_objects(benchmark, options.limit)
-    steps = dict(enumerate(LADDERS[options.table](benchmark.protocol.pose)))
+    steps = dict(enumerate(pipelines(benchmark.protocol.pose)))
     chosen = [k for k in options.steps or steps if k in steps]
     settings = [steps[k][1].describe() for k in chosen]
     code = [results_digest(), file_digest(Path(__file__))]
@@ -245,7 +218,7 @@ def climb(name: str, root: Path, options: argparse.Namespace) -> None:
         digests = [file_digest(path) for path in files]
         request = json.dumps([code, settings, requests, digests])
         path = options.out / name / f"{text_digest(request)}.json"
-        given = (options.table, root, options.pixel_origin, group, chosen)
+        given = (root, options.pixel_origin, group, chosen)
         jobs.append(Part(path, given, len(group)))
     # In a fixed random order: the part that an interrupted run has measured is a fair one.
     jobs.sort(key=lambda job: job.path.name)
@@ -253,7 +226,7 @@ def climb(name: str, root: Path, options: argparse.Namespace) -> None:
         jobs = [job for job in jobs if job.path.exists()]
     complete(jobs, measure, label=name, jobs=options.jobs, quiet=options.quiet)
     names = {k: steps[k][0] for k in chosen}
-    record(name, names, [read_part(job) for job in jobs], options.out / f"{options.table}.csv")
+    record(name, names, [read_part(job) for job in jobs], options.out / "staircase.csv")
 
 
 def record(name: str, steps: dict[int, str], records: list[dict[str, Any]], path: Path) -> None:
@@ -290,22 +263,23 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def table(rows: list[dict[str, str]], ladder: str = "staircase") -> str:
+def table(rows: list[dict[str, str]]) -> str:
     """Markdown: one line for each step, one column for each set; share within 30 degrees and median
     error."""
     names = list(dict.fromkeys(row["set"] for row in rows))
     known = {(row["set"], int(row["step"])): row for row in rows}
     counts = {name: max(int(row["n"]) for row in rows if row["set"] == name) for name in names}
-    cells = [[HEADERS[ladder], *(f"`{name}`, N {counts[name]}" for name in names)]]
-    for k, (step, _) in enumerate(LADDERS[ladder]("any")):
+    cells = [["change", *(f"`{name}`, N {counts[name]}" for name in names)]]
+    for k, (step, _) in enumerate(pipelines("any")):
         found = [known.get((name, k)) for name in names]
         cells.append([step, *("-" if row is None else cell_of(row) for row in found)])
     commits = ", ".join(sorted({row["commit"] for row in rows}))
     text = (
         "Share of the rotations within 30° with its 95 % interval by bootstrap of the CADs (none "
-        "for one or two of them), and median error, up to symmetries where they are known"
+        "for one or two of them), and median error, up to symmetries where they are known; each "
+        "line adds one change to the line above"
     )
-    return "\n".join([f"{text}{TEXTS[ladder]}. Commit {commits}.", "", *table_lines(cells), ""])
+    return "\n".join([f"{text}. Commit {commits}.", "", *table_lines(cells), ""])
 
 
 def cell_of(row: dict[str, str]) -> str:
@@ -323,9 +297,6 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument(
         "--limit", type=int, metavar="N", help="N objects of each set, spread evenly"
-    )
-    parser.add_argument(
-        "--table", choices=LADDERS, default="staircase", help="what is measured (staircase)"
     )
     parser.add_argument("--steps", type=int, nargs="+", help="numbers of steps (default: all)")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
@@ -347,9 +318,9 @@ def main() -> int:
     except CurviregError as error:
         print(f"staircase: error: {error}", file=sys.stderr)
         return 2
-    print(text := table(read(options.out / f"{options.table}.csv"), options.table))
+    print(text := table(read(options.out / "staircase.csv")))
     if options.page is not None:
-        update_page(options.page, options.table, text)
+        update_page(options.page, "staircase", text)
     return 0
 
 

@@ -3,11 +3,9 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from curvireg_torch.filters.focus import PAPER_THRESHOLD
-from curvireg_torch.utils.files import write_csv, write_file
 from scripts._shared import table_lines
 from scripts.paper import printed
 from scripts.paper.measures import Estimate, bootstrap
@@ -19,12 +17,15 @@ PHOTOS = ("MFC", "MCS", "IG")
 REPEATED_DEPTHS = ("CS", "ASG", "HFN")
 PAIRS = printed.PAIRS
 SEARCHED_PAIRS = PAIRS[:3]
+REFINED_PAIRS = PAIRS[:2]
 RANKS = (1, 3, 5, 10, 20)
 GRIDS = (4, 8, 16)
 RIGHT_DEG = 30.0
 VARIANTS = ("literal", "printed", "corrected")
 NAMES = {"literal": "literal", "printed": "corrected, S_hog as printed", "corrected": "corrected"}
 CLASS_DETECTORS = ("MFC", "MCS", "PCI", "SOBEL", "CANNY")
+# degrees about the object's z axis: 40 views, the true one among them
+CURVE_OFFSETS = tuple(range(-100, 100, 5))
 SHOWN_OFFSETS = (-90, -20, -10, -5, 0, 5, 10, 20, 90)
 PARTS = ("elevation", "azimuth", "in-plane", "distance")
 POSE_COLUMNS = tuple(f"{name} {kind}" for name in PARTS for kind in ("Est.", "Clo."))
@@ -35,7 +36,7 @@ class Table:
     """Rows of numbers with their definition.
 
     Attributes:
-        name: of the files.
+        name: of the file.
         title, definition: what was measured, on what.
         columns: the first names the rows.
         rows: as long as ``columns``.
@@ -51,29 +52,6 @@ class Table:
         """Title, definition and table; means with their intervals."""
         lines = table_lines([self.columns, *([str(cell) for cell in row] for row in self.rows)])
         return "\n".join([f"### {self.title}", "", self.definition, "", *lines, ""])
-
-    def write(self, folder: Path) -> None:
-        """Write ``NAME.csv``, with columns for the ends of intervals and N, and ``NAME.md``."""
-        header: list[str] = []
-        for k, column in enumerate(self.columns):
-            wide = any(isinstance(row[k], Estimate) for row in self.rows)
-            header += [
-                column,
-                *([f"{column} {end}" for end in ("low", "high", "N")] if wide else []),
-            ]
-        rows = [
-            [value for k in range(len(self.columns)) for value in self._values(row, k)]
-            for row in self.rows
-        ]
-        write_csv(folder / f"{self.name}.csv", [header, *rows])
-        write_file(folder / f"{self.name}.md", self.markdown().encode())
-
-    def _values(self, row: Sequence[Cell], k: int) -> list[object]:
-        cell = row[k]
-        if isinstance(cell, Estimate):
-            return [cell.mean, cell.low, cell.high, cell.n]
-        wide = any(isinstance(other[k], Estimate) for other in self.rows)
-        return [cell, "", "", ""] if wide else [cell]
 
 
 class Records:
@@ -106,17 +84,6 @@ class Records:
         )
 
 
-def by_class(name: str, title: str, records: Records, columns: dict[str, Value]) -> Table:
-    """One row for each category, and one for all."""
-    groups = [(category, records.of(category)) for category in records.categories] + [
-        ("all", records)
-    ]
-    rows = [
-        [category, *(group.mean(value) for value in columns.values())] for category, group in groups
-    ]
-    return Table(f"{name}_by_class", f"{title} by class", records.text, ["class", *columns], rows)
-
-
 def beside_the_paper(
     name: str,
     title: str,
@@ -124,7 +91,6 @@ def beside_the_paper(
     columns: dict[str, list[Value]],
     paper: dict[str, dict[str, float]],
     parts: Sequence[str],
-    digits: int,
 ) -> Table:
     """One row for each class that we or the paper have. Cells hold our numbers, one for each of
     ``parts``, and the paper's."""
@@ -134,8 +100,8 @@ def beside_the_paper(
         cells: list[Cell] = []
         for column, values in columns.items():
             means = [group.mean(value) for value in values]
-            ours = [_printed(one.mean if one.n else None, digits) for one in means]
-            theirs = _printed(paper.get(category, {}).get(column), digits)
+            ours = [_printed(one.mean if one.n else None) for one in means]
+            theirs = _printed(paper.get(category, {}).get(column))
             cells.append(" / ".join([*ours, theirs]))
         rows.append([category, f"{len(group.records)}", *cells])
     text = f"{' / '.join([*parts, 'the paper'])}; N photographs of ours. {records.what}."
@@ -153,17 +119,17 @@ def at(*keys: str | int) -> Value:
     return value
 
 
-def _printed(number: float | None, digits: int) -> str:
+def _printed(number: float | None, digits: int = 2) -> str:
     return "-" if number is None else f"{number:.{digits}f}"
 
 
 def detector_tables(records: Records) -> list[Table]:
-    """IP, Hausdorff distance and number of points of each detector."""
+    """IP, Hausdorff distance and number of points of each detector, and IP by class."""
     names = list(records.records[0]["points"])
     rows: list[list[Cell]] = []
     for name in names:
         ours = [records.mean(at(kind, name)) for kind in ("ip", "hausdorff", "points")]
-        ip = [_printed(means.get(name), 2) for means in (printed.IP, printed.WEB_IP)]
+        ip = [_printed(means.get(name)) for means in (printed.IP, printed.WEB_IP)]
         distances = printed.HAUSDORFF, printed.WEB_HAUSDORFF
         hausdorff = [_printed(means.get(name), 0) for means in distances]
         rows.append([name, ours[0], *ip, ours[1], *hausdorff, ours[2]])
@@ -188,30 +154,11 @@ def detector_tables(records: Records) -> list[Table]:
         "paper, web ",
         "points",
     ]
-    tables = [Table("detectors", "Detectors: IP and Hausdorff distance", text, columns, rows)]
-    tables += [
-        beside_the_paper(
-            "ip",
-            "IP by class",
-            records,
-            {name: [at("ip", name)] for name in CLASS_DETECTORS},
-            printed.IP_BY_CLASS,
-            ("ours",),
-            2,
-        ),
-        beside_the_paper(
-            "hausdorff",
-            "Hausdorff distance by class",
-            records,
-            {name: [at("hausdorff", name)] for name in CLASS_DETECTORS},
-            printed.HAUSDORFF_BY_CLASS,
-            ("ours",),
-            0,
-        ),
+    of_class = {name: [at("ip", name)] for name in CLASS_DETECTORS}
+    return [
+        Table("detectors", "Detectors: IP and Hausdorff distance", text, columns, rows),
+        beside_the_paper("ip", "IP by class", records, of_class, printed.IP_BY_CLASS, ("ours",)),
     ]
-    for kind in ("ip", "hausdorff"):
-        tables.append(by_class(kind, kind, records, {name: at(kind, name) for name in names}))
-    return tables
 
 
 def repeatability_tables(records: Records) -> list[Table]:
@@ -236,25 +183,20 @@ def repeatability_tables(records: Records) -> list[Table]:
     ]
 
 
-def curve_tables(records: Records, offsets: Sequence[int]) -> list[Table]:
-    """Repeatability in 40 views around the true one."""
+def curve_tables(records: Records) -> list[Table]:
+    """Repeatability in some of the 40 views around the true one."""
     names = list(records.records[0]["curve"])
-
-    rows = [
-        [f"{offset}", *(records.mean(at("curve", name, k)) for name in names)]
-        for k, offset in enumerate(offsets)
-    ]
+    rows: list[list[Cell]] = []
+    for offset in SHOWN_OFFSETS:
+        k = CURVE_OFFSETS.index(offset)
+        rows.append([f"{offset}", *(records.mean(at("curve", name, k)) for name in names)])
     text = (
         "Fraction of the points of the view with a point of the photograph within 2 px, with the "
         "object turned about "
         f"its z axis by so many degrees from the true pose. {records.text}"
     )
-    shown = [row for row in rows if int(str(row[0])) in SHOWN_OFFSETS]
     columns = ["degrees", *names]
-    return [
-        Table("curve_all", "Repeatability in 40 views", text, columns, rows),
-        Table("curve", "Repeatability around the true view", text, columns, shown),
-    ]
+    return [Table("curve", "Repeatability around the true view", text, columns, rows)]
 
 
 def sensitivity_tables(records: Records) -> list[Table]:
@@ -264,10 +206,10 @@ def sensitivity_tables(records: Records) -> list[Table]:
     settings = sorted({(float(key[1]), float(key[2])) for key in keys})
     rows: list[list[Cell]] = []
     for share, eps in settings:
+        if share != 0.04 and eps != 2.0:  # one of the two is usual
+            continue
         cells = [records.mean(at("sensitivity", f"{name} {share:g} {eps:g}")) for name in names]
         rows.append([f"{100 * share:g} %", f"{eps:g} px", *cells])
-    # of these, the page has those in which one of the two is usual
-    shown = [row for row in rows if row[0] == "4 %" or row[1] == "2 px"]
     thresholds = [
         ["4 %", f"2 px, threshold {name}", records.mean(at("threshold", name)), *others]
         for others in [["-"] * (len(names) - 1)]
@@ -278,10 +220,7 @@ def sensitivity_tables(records: Records) -> list[Table]:
         f"thresholds of MFC (the paper: .0067). {records.text}"
     )
     columns = ["points", "eps", *names]
-    return [
-        Table("sensitivity_all", "Sensitivity of IP", text, columns, [*rows, *thresholds]),
-        Table("sensitivity", "Sensitivity of IP", text, columns, [*shown, *thresholds]),
-    ]
+    return [Table("sensitivity", "Sensitivity of IP", text, columns, [*rows, *thresholds])]
 
 
 def _right(variant: str, pair: str, rank: int) -> Value:
@@ -310,14 +249,14 @@ def precision_tables(records: Records) -> list[Table]:
     rows: list[list[Cell]] = []
     for pair in PAIRS:
         cells = [records.mean(_right(variant, pair, 1)) for variant in VARIANTS]
-        rows.append([pair, *cells, _printed(printed.PRECISION[pair], 2)])
+        rows.append([pair, *cells, _printed(printed.PRECISION[pair])])
     rows += limit_rows(records, 5)
     text = (
         f"Fraction of the photographs whose best view is within {RIGHT_DEG:g}° of the true one "
         f"(the paper does not "
         f"define its precision), before the search. {records.text}"
     )
-    tables = [
+    return [
         Table(
             "precision",
             "Precision, nine pairs",
@@ -332,13 +271,8 @@ def precision_tables(records: Records) -> list[Table]:
             {pair: [_right(variant, pair, 1) for variant in VARIANTS] for pair in SEARCHED_PAIRS},
             printed.PRECISION_BY_CLASS,
             tuple(NAMES.values()),
-            2,
         ),
     ]
-    for variant in VARIANTS:
-        columns = {pair: _right(variant, pair, 1) for pair in PAIRS}
-        tables.append(by_class(f"precision_{variant}", "Precision", records, columns))
-    return tables
 
 
 def rank_tables(records: Records) -> list[Table]:
@@ -349,22 +283,18 @@ def rank_tables(records: Records) -> list[Table]:
         f"{records.text}"
     )
     columns = ["depth / photograph", *(f"k = {k}" for k in RANKS)]
-    tables = []
-    page: list[list[Cell]] = []
+    rows: list[list[Cell]] = []
     for variant in VARIANTS:
-        of_pairs: dict[str, list[Cell]] = {
-            pair: [records.mean(_right(variant, pair, k)) for k in RANKS] for pair in PAIRS
-        }
-        lot: list[Cell] = [records.mean(_by_lot(variant, k)) for k in RANKS]
-        ceiling: list[Cell] = [records.mean(at(variant, "ceiling"))] * len(RANKS)
-        limits = [["views by lot", *lot], ["a right view is there", *ceiling]]
-        rows = [*([pair, *cells] for pair, cells in of_pairs.items()), *limits]
-        title = f"Precision at rank k, {NAMES[variant]}"
-        tables.append(Table(f"ranks_{variant}", title, text, columns, rows))
-        page += [[f"{NAMES[variant]}, {pair}", *of_pairs[pair]] for pair in SEARCHED_PAIRS]
+        name = NAMES[variant]
+        for pair in SEARCHED_PAIRS:
+            cells = [records.mean(_right(variant, pair, k)) for k in RANKS]
+            rows.append([f"{name}, {pair}", *cells])
         if variant != "printed":  # whose views are those of the last
-            page += [[f"{NAMES[variant]}, {name}", *cells] for name, *cells in limits]
-    return [Table("ranks", "Precision at rank k", text, columns, page), *tables]
+            lot = [records.mean(_by_lot(variant, k)) for k in RANKS]
+            ceiling = records.mean(at(variant, "ceiling"))
+            rows.append([f"{name}, views by lot", *lot])
+            rows.append([f"{name}, a right view is there", *[ceiling] * len(RANKS)])
+    return [Table("ranks", "Precision at rank k", text, columns, rows)]
 
 
 def angle_tables(records: Records) -> list[Table]:
@@ -380,37 +310,26 @@ def angle_tables(records: Records) -> list[Table]:
         f"of symmetric objects count in full. {records.text}"
     )
     columns = ["depth / photograph", *POSE_COLUMNS]
-    tables = []
-    page: list[list[Cell]] = []
-    for variant in VARIANTS:
-        rows: list[list[Cell]] = []
-        for pair in PAIRS:
-            cells = [
-                records.mean(at(variant, pair, kind, k))
-                for k in range(4)
-                for kind in ("est", "clo")
-            ]
-            rows.append([pair, *cells])
-            if all("refined" in record[variant][pair] for record in records.records):
-                refined = (records.mean(at(variant, pair, "refined", k)) for k in range(4))
-                rows.append(
-                    [f"{pair}, of refined views", *(c for cell in refined for c in ("-", cell))]
-                )
-            if pair in printed.POSE_ERRORS:
+    rows: list[list[Cell]] = []
+
+    def means(*keys: str) -> list[Estimate]:
+        return [records.mean(at(*keys, k)) for k in range(4)]
+
+    def beside(left: Sequence[Cell], right: Sequence[Cell]) -> list[Cell]:
+        return [cell for pair in zip(left, right, strict=True) for cell in pair]
+
+    nothing = ["-"] * 4
+    for variant in ("literal", "corrected"):
+        name = NAMES[variant]
+        for pair in REFINED_PAIRS:
+            found = beside(means(variant, pair, "est"), means(variant, pair, "clo"))
+            rows.append([f"{name}, {pair}", *found])
+            if variant == "corrected":
+                refined = beside(nothing, means(variant, pair, "refined"))
+                rows.append([f"{name}, {pair}, of refined views", *refined])
                 rows.append([f"{pair}, paper", *printed.POSE_ERRORS[pair]])
-        limits = [cell for k in range(4) for cell in ("-", records.mean(at(variant, "limit", k)))]
-        rows.append(["bank", *limits])
-        title = f"Errors of the pose, {NAMES[variant]}"
-        tables.append(Table(f"angles_{variant}", title, text, columns, rows))
-        kept = ("CS/MFC", "CS/MCS", "bank")
-        shown = [row for row in rows if str(row[0]).startswith(kept)]
-        if variant != VARIANTS[-1]:  # the paper's rows stand once
-            shown = [row for row in shown if not str(row[0]).endswith("paper")]
-        if variant != "printed":
-            names = [str(row[0]) for row in shown]
-            names = [x if x.endswith("paper") else f"{NAMES[variant]}, {x}" for x in names]
-            page += [[x, *row[1:]] for x, row in zip(names, shown, strict=True)]
-    return [Table("angles", "Errors of the pose", text, columns, page), *tables]
+        rows.append([f"{name}, bank", *beside(nothing, means(variant, "limit"))])
+    return [Table("angles", "Errors of the pose", text, columns, rows)]
 
 
 def search_tables(records: Records) -> list[Table]:
