@@ -28,7 +28,7 @@ def poses_at(*degrees, x=0.0):
 
 def evidence_of(*similarity, **columns):
     """Evidence with these similarities, or columns of other names; the others are 0."""
-    columns = columns or {"similarity": similarity}
-    count = len(next(iter(columns.values())))
-    values = {field.name: torch.zeros(count, dtype=torch.float64) for field in fields(Evidence)}
-    return Evidence(**values | {name: double(column) for name, column in columns.items()})
+    known = {name: double(column) for name, column in columns.items()}
+    known = known or {"similarity": double(similarity)}
+    nothing = torch.zeros_like(next(iter(known.values())))
+    return Evidence(**{field.name: known.get(field.name, nothing) for field in fields(Evidence)})

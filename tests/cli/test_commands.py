@@ -23,6 +23,7 @@ from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import DEFAULT, PRESETS, ViewPolicy
 from scripts.robustness.wrong_inputs import cases
+from tests._support.numbers import double
 from tests._support.scenes import truck_bank
 from tests._support.small import SMALL
 from tests.viewer.test_session import write_scene
@@ -131,13 +132,10 @@ def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
     assert main(["demo", "--out", str(tmp_path), "--quiet"]) == 0
     assert options["progress"] is False
     result = json.loads((tmp_path / "result.json").read_text())
-    R, t = (
-        torch.tensor(result["truth"][name], dtype=torch.float64)
-        for name in ("rotation", "translation")
-    )
-    estimate = torch.tensor(result["rotation"], dtype=torch.float64)
+    R, t = (double(result["truth"][name]) for name in ("rotation", "translation"))
+    estimate = double(result["rotation"])
     assert result["rotation_error_deg"] == pytest.approx(float(rotation_error(estimate, R)))
-    error = (torch.tensor(result["translation"], dtype=torch.float64) - t).norm() / t.norm()
+    error = (double(result["translation"]) - t).norm() / t.norm()
     assert result["translation_error"] == pytest.approx(float(error))
     points = torch.tensor(trimesh.load(tmp_path / "mesh.ply").vertices.copy()) @ R.T + t
     pixels = 1040.0 * points[:, :2] / points[:, 2:] + torch.tensor([479.5, 359.5])

@@ -17,6 +17,7 @@ from curvireg_torch import cli
 from curvireg_torch.geometry import rotation_error, transform
 from curvireg_torch.geometry.cameras import pose_from_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from tests._support.numbers import double
 
 from .._support import miniature
 from .._support.exif import exif, with_exif
@@ -59,7 +60,7 @@ def pose(azimuth):
     """(4, 4) pose of the truck in m, whose box is about 410 220 890 700."""
     points = torch.from_numpy(example_mesh().vertices.copy())
     box = torch.tensor([410.0, 220.0, 890.0, 700.0])
-    view = cr.rotation_from_viewpoint(torch.tensor(azimuth, dtype=torch.float64), 30.0, 0.0)
+    view = cr.rotation_from_viewpoint(double(azimuth), 30.0, 0.0)
     return transform(
         *pose_from_box(points, view, box, cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0))
     )
@@ -71,7 +72,7 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("newcomer")
     mesh = example_mesh()
     size = (1080, 1920)
-    quarter = torch.diag(torch.tensor([0.25, 0.25, 1.0], dtype=torch.float64))
+    quarter = torch.diag(double([0.25, 0.25, 1.0]))
     K = quarter @ cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0, dtype=torch.float64)
     for seed, (name, azimuth) in enumerate(AZIMUTHS.items()):
         generator = torch.Generator().manual_seed(seed)
@@ -188,10 +189,10 @@ def test_page_runs(page, monkeypatch, capsys):
                 and not any(word.startswith("--up=") for word in words)
             ):
                 result = json.loads(Path("out/part/result.json").read_text("utf-8"))
-                R = torch.tensor(result["rotation"], dtype=torch.float64)
+                R = double(result["rotation"])
                 # without a camera R is allocentric
                 allowed = 20 if result["translation"] is None else 5
-                assert float(rotation_error(R, pose(30.0)[:3, :3])) < allowed
+                assert rotation_error(R, pose(30.0)[:3, :3]) < allowed
     for name in re.findall(r"`((?:out|results)/[\w/.]+\.\w+)`", page.read_text(encoding="utf-8")):
         assert Path(name).is_file(), f"the page promises {name}"
 

@@ -20,9 +20,10 @@ from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.terms import crop_photographs
+from tests._support.numbers import double
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, fitted, noise, pose, silhouette
 
-CENTRE = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
+CENTRE = double([0.2, -0.1, 0.3])
 T = pose([0.3, -0.5, 0.2], [0.1, 0.2, 6.0])[None]
 FIRST = torch.tensor([0])
 
@@ -33,7 +34,7 @@ class ParabolicEdges:
 
     def __init__(self, distances, heights):
         self.distances = distances
-        self.heights = torch.tensor(heights, dtype=torch.float64)
+        self.heights = double(heights)
 
     def strength(self, uv, normals, offsets, image_index):
         apart = (offsets - self.distances[:, :, None]) / 1.5
@@ -60,7 +61,7 @@ def state(count, valid=None):
 
 
 def at(count, *distances):
-    return torch.tensor(distances, dtype=torch.float64)[:, None].expand(-1, count)
+    return double(distances)[:, None].expand(-1, count)
 
 
 def twist_of(one, points, radius):
@@ -101,9 +102,9 @@ def test_step_undoes_a_motion_despite_stronger_wrong_edges():
     """Edges at the points of the moved object, and for every third point a stronger one 4 px beside
     it."""
     points = state(120).points
-    motion = torch.tensor([0.006, -0.008, 0.01, 0.01, -0.015, 0.06], dtype=torch.float64)
+    motion = double([0.006, -0.008, 0.01, 0.01, -0.015, 0.06])
     distance = project(points.model, points.normals, T, K[None], CENTRE)[1] @ motion
-    assert float(distance.abs().max()) > 1.5
+    assert distance.abs().max() > 1.5
     sides = torch.where(torch.arange(120) % 2 == 0, 4.0, -4.0)
     wrong = torch.where(torch.arange(120) % 3 == 0, distance + sides, 90.0)
     found = twist_of(problem(torch.cat([distance, wrong]), [0.5, 0.6]), points, 6.0)
@@ -112,26 +113,24 @@ def test_step_undoes_a_motion_despite_stronger_wrong_edges():
 
 def test_edge_strength_peaks_on_a_slanted_edge():
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
-    n = torch.tensor([[[0.8, 0.6]]], dtype=torch.float64)
+    n = double([[[0.8, 0.6]]])
     image = torch.sigmoid(4 * (0.8 * x + 0.6 * y - 44.0))[None, None]
-    here = torch.tensor([[[32.0, 31.0]]], dtype=torch.float64)  # 0.2 px from the edge
+    here = double([[[32.0, 31.0]]])  # 0.2 px from the edge
     edges = EdgeField(image)
     offsets = torch.arange(-5, 6, dtype=torch.float64)
     across = edges.strength(here, n, offsets, FIRST)[0, 0]
     assert int(across.argmax()) == 5
     assert float(across[0]) < 0.1 * float(across[5])
     along = edges.strength(here, n.flip(-1) * torch.tensor([-1.0, 1.0]).double(), offsets, FIRST)
-    assert float(along.max()) < 0.01
-    assert float(edges.strength(here + 500, n, offsets, FIRST).max()) == 0
+    assert along.max() < 0.01
+    assert edges.strength(here + 500, n, offsets, FIRST).max() == 0
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_edge_strength_falls_with_the_fifth_power_of_the_cosine_in_the_strongest_channel(sign):
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
     ramp = sign * torch.tensor([0.004, 0.01, -0.005])[:, None, None] * (0.8 * x + 0.6 * y)
-    angles = math.atan2(0.6, 0.8) + torch.tensor(
-        [0.0, 0.3, -0.6, 1.0, math.pi / 2, math.pi], dtype=torch.float64
-    )
+    angles = math.atan2(0.6, 0.8) + double([0.0, 0.3, -0.6, 1.0, math.pi / 2, math.pi])
     n = torch.stack([angles.cos(), angles.sin()], dim=-1)[None]
     here = torch.tensor([31.5, 30.2]).double().expand(1, 6, 2)
     strength = EdgeField(ramp[None]).strength(here, n, torch.zeros(1), FIRST)[0, :, 0].double()
@@ -145,7 +144,7 @@ def test_edges_outside_the_photograph_do_not_count():
     inside = torch.zeros(1, 1, 64, 64)
     inside[..., :32] = 1.0
     edges = EdgeField(torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0)), inside)
-    uv = torch.tensor([[[10.0, 20.0], [12.0, 40.0], [50.0, 20.0]]], dtype=torch.float64)
+    uv = double([[[10.0, 20.0], [12.0, 40.0], [50.0, 20.0]]])
     n = torch.tensor([1.0, 0.0]).double().expand(1, 3, 2)
     valid = torch.ones(1, 3, dtype=torch.bool)
     assert (edges.strength(uv, n, torch.zeros(1).double(), FIRST)[0, :, 0] > 0).tolist() == [
@@ -161,8 +160,8 @@ def test_edges_outside_the_photograph_do_not_count():
     inside = inside_boxes(
         photograph_box((40, 20))[None], torch.tensor([[9.5, 9.5, 29.5, 29.5]]), 40, 0.0
     )
-    assert bool(inside[0, 0, :, :20].all())
-    assert float(inside[0, 0, :, 21:].max()) == 0.0
+    assert inside[0, 0, :, :20].all()
+    assert inside[0, 0, :, 21:].max() == 0.0
 
 
 def half_planes(*columns):
@@ -172,7 +171,7 @@ def half_planes(*columns):
 
 
 def row_of_points(outline, direction, *, count=1):
-    normals = torch.tensor([direction, 0.0], dtype=torch.float64).expand(count, 1, 2)
+    normals = double([direction, 0.0]).expand(count, 1, 2)
     there = torch.ones(count, 1, dtype=torch.bool)
     return ContourPoints(
         torch.zeros(count, 1, 3, dtype=torch.float64), normals, there, there & outline
@@ -196,12 +195,12 @@ def test_mask_weights_within_at_the_border_and_beyond_in_the_crop_of_each_pose()
         assert weights[0, 0].tolist() == pytest.approx(expected)
     # Borders at 128 and 64 of 256 px are at 64 and 32 of 128 px; the mask is read 3 px to both
     # sides there.
-    uv = torch.tensor([[[31.5, 50.0]], [[63.5, 50.0]], [[31.5, 50.0]]], dtype=torch.float64)
+    uv = double([[[31.5, 50.0]], [[63.5, 50.0]], [[31.5, 50.0]]])
     here = torch.zeros(1, dtype=torch.float64)
     index = torch.tensor([0, 0, 1])
     found = half_planes(128, 64).weights(uv, row_of_points(True, 1.0, count=3), here, index, 128)
     assert found.flatten().tolist() == pytest.approx([0.6, 2.0, 2.0])
-    off = torch.tensor([-2.4, 2.4, -3.6, 3.6], dtype=torch.float64)
+    off = double([-2.4, 2.4, -3.6, 3.6])
     found = half_planes(128).weights(uv[1:2], row_of_points(True, 1.0), off, FIRST, 128)
     assert found.flatten().tolist() == pytest.approx([2.0, 2.0, 0.6, 0.6])
 
@@ -249,12 +248,12 @@ def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
     contours = MeshContours(mesh)
     fit = fit_contours(contours, image, box, camera, start)
     R = fit.transform[0, :3, :3]
-    assert float(rotation_error(R, truth[:3, :3])) < 0.6
-    assert float((fit.transform[0, :3, 3] - truth[:3, 3]).norm() / truth[:3, 3].norm()) < 0.01
+    assert rotation_error(R, truth[:3, :3]) < 0.6
+    assert ((fit.transform[0, :3, 3] - truth[:3, 3]).norm() / truth[:3, 3].norm()) < 0.01
     torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64))
     C = fit.covariance[0]
-    assert float(torch.linalg.eigvalsh(C).min()) > 0
-    assert 0.001 < float(torch.rad2deg(C.diagonal()[:3].sqrt()).max()) < 5.0
+    assert torch.linalg.eigvalsh(C).min() > 0
+    assert 0.001 < torch.rad2deg(C.diagonal()[:3].sqrt()).max() < 5.0
     assert int(fit.observable) == 6
     assert float(fit.start_support) < float(fit.edge_support)
     crops = EdgeCrops.cut([image], box[None], 0.1)
@@ -264,10 +263,10 @@ def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
 
 @pytest.mark.parametrize("degrees", [8.0, 14.0])
 def test_fit_begins_from_rotations_of_the_start_too(degrees):
-    twist = torch.tensor([[0.0, math.radians(degrees), 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    twist = double([[0.0, math.radians(degrees), 0.0, 0.0, 0.0, 0.0]])
     start = apply_twist(CUBE_POSE[None], twist, mesh_centre(cube()))
     found = fitted(silhouette(cube(), CUBE_POSE), start).transform[0]
-    assert float(rotation_error(found[:3, :3], CUBE_POSE[:3, :3])) < 2.0
+    assert rotation_error(found[:3, :3], CUBE_POSE[:3, :3]) < 2.0
 
 
 def test_fit_without_edges_returns_the_start():
@@ -282,7 +281,7 @@ def test_fit_without_edges_returns_the_start():
         fit = fitted(image, start)
         assert fit.transform.equal(start)
         assert float(fit.edge_support) == 0
-        assert bool(fit.covariance.isnan().all())
+        assert fit.covariance.isnan().all()
 
 
 def test_a_grey_photograph_counts_as_three_equal_channels():
@@ -310,10 +309,7 @@ def several():
         images.append((255 * image).round().byte())
         boxes.append(box)
         cameras.append(camera)
-        off = torch.tensor(
-            [[0.05, -0.03, 0.02, 0.0, 0.0, 0.05], [0.0, 0.4, 0.0, 0.0, 0.05, 0.0]],
-            dtype=torch.float64,
-        )
+        off = double([[0.05, -0.03, 0.02, 0.0, 0.0, 0.05], [0.0, 0.4, 0.0, 0.0, 0.05, 0.0]])
         starts.append(
             apply_twist(truth.repeat(2, 1, 1), off, torch.zeros(3, dtype=torch.float64))[
                 : 2 - i // 2
@@ -348,7 +344,7 @@ def test_fits_of_a_batch_equal_single_fits():
 
 def test_fit_finishes_the_best_starts_of_each_photograph():
     images, boxes, cameras, starts, image_index = several()
-    off = torch.tensor([0.6, 0.5, 0.7, 0.0, 0.0, 0.4], dtype=torch.float64).expand(5, 6)
+    off = double([0.6, 0.5, 0.7, 0.0, 0.0, 0.4]).expand(5, 6)
     both = torch.cat([apply_twist(starts, off, mesh_centre(cube())), starts])
     index = torch.cat([image_index, image_index])
     contours = MeshContours(cube())
@@ -364,7 +360,7 @@ def test_fit_finishes_the_best_starts_of_each_photograph():
 
 
 def test_start_support_is_at_full_size_and_trustworthy_depends_on_support_or_gain():
-    off = torch.tensor([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]], dtype=torch.float64)
+    off = double([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]])
     start = apply_twist(CUBE_POSE[None], off, mesh_centre(cube()))
     image = silhouette(cube(), CUBE_POSE)
     expected = contour_support(
@@ -372,8 +368,8 @@ def test_start_support_is_at_full_size_and_trustworthy_depends_on_support_or_gai
     )
     fit = fitted(image, start)
     torch.testing.assert_close(fit.start_support, expected)
-    assert bool(fit.trustworthy)
-    assert not bool(fitted(noise(), start).trustworthy)
+    assert fit.trustworthy
+    assert not fitted(noise(), start).trustworthy
     none = torch.zeros(4)
     supports = (torch.tensor([0.51, 0.49, 0.35, 0.25]), torch.tensor([0.49, 0.45, 0.1, 0.1]))
     assert ContourFit(none, none, *supports, none).trustworthy.tolist() == [
@@ -441,7 +437,7 @@ def test_known_short_fits_change_nothing_and_fitted_poses_are_kept():
     mixed = torch.stack([first.transform[0], starts[1]])
     again = fit_to_edges(*problem, mixed, FIRST.repeat(2), refit=True)
     assert again.transform[0].equal(mixed[0])
-    assert float(rotation_error(again.transform[1, :3, :3], CUBE_POSE[:3, :3])) < 1
+    assert rotation_error(again.transform[1, :3, :3], CUBE_POSE[:3, :3]) < 1
 
 
 def test_a_fit_begins_around_its_start_and_farther_away_if_it_is_a_second_one(monkeypatch):

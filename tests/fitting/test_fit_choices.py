@@ -1,10 +1,7 @@
 """Which of several fits counts: the one with the most support, by the weights of the mask."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.fitting import contour_fit
 from curvireg_torch.fitting.contour_fit import fit_to_edges
@@ -16,8 +13,6 @@ from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.rendering.contours import MeshContours
 from tests._support.numbers import double
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, silhouette
-
-Weigh = Callable[[ContourProblem, ContourState, Tensor], Tensor]
 
 
 def starts(*degrees):

@@ -24,6 +24,7 @@ from curvireg_torch.registration.hypotheses import fit_poses, placed
 from curvireg_torch.registration.photograph import as_photographs
 from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background
+from tests._support.numbers import double
 from tests._support.quick import slow_after
 
 SIZE = (360, 480)
@@ -64,7 +65,7 @@ def keypoints():
 
 def pose(azimuth, x, z):
     R = rotation_from_viewpoint(azimuth, 25.0, 10.0).double()
-    return transform(R, torch.tensor([x, 0.1, z], dtype=torch.float64))
+    return transform(R, double([x, 0.1, z]))
 
 
 def photograph(*poses, shown=None):
@@ -88,8 +89,8 @@ def test_pose_is_that_of_the_print(azimuth, with_box):
     best, *others = keypoints().matches(photograph(T), K, box_of(T) if with_box else None).poses()
     assert all(other.count < 12 for other in others)
     assert best.count >= 15
-    assert float(rotation_error(best.T[:3, :3], T[:3, :3])) < 2.0
-    assert float((best.T - T)[:3, 3].norm()) < 0.02 * 4.0
+    assert rotation_error(best.T[:3, :3], T[:3, :3]) < 2.0
+    assert (best.T - T)[:3, 3].norm() < 0.02 * 4.0
 
 
 def test_photograph_may_be_large_and_of_any_dtype(monkeypatch):
@@ -98,8 +99,8 @@ def test_photograph_may_be_large_and_of_any_dtype(monkeypatch):
     image = (255.0 * photograph(T)).round().to(torch.uint8)
     monkeypatch.setattr(keypoints_module, "MAX_SIDE", 400)
     (found,) = keypoints().matches(image, K).poses()
-    assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 3.0
-    assert float((found.T - T)[:3, 3].norm()) < 0.02 * 4.0
+    assert rotation_error(found.T[:3, :3], T[:3, :3]) < 3.0
+    assert (found.T - T)[:3, 3].norm() < 0.02 * 4.0
 
 
 @pytest.mark.slow
@@ -109,7 +110,7 @@ def test_photograph_may_be_dark():
     dark = (255 * 0.1 * bright).round() / 255
     most, found = (keypoints().matches(image, K, box_of(T)).poses()[0] for image in (bright, dark))
     assert found.count > 0.5 * most.count
-    assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 3.0
+    assert rotation_error(found.T[:3, :3], T[:3, :3]) < 3.0
     # nor does one of a single colour fail
     assert not len(keypoints().matches(torch.full_like(bright, 0.3), K).uv)
     alone = render_colour(mesh(), T[None], K[None], SIZE)[0]
@@ -134,7 +135,7 @@ def test_each_copy_has_a_pose():
         [rotation_error(one.T[:3, :3], torch.stack(there)[:, :3, :3]) for one in found]
     )
     assert sorted(errors.argmin(dim=1).tolist()) == [0, 1]
-    assert float(errors.amin(dim=1).max()) < 3.0
+    assert errors.amin(dim=1).max() < 3.0
 
 
 def test_nothing_is_found_where_the_print_is_not():
@@ -159,10 +160,10 @@ def test_keypoints_agree_with_the_poses_of_their_object():
         ]
     )
     counts = matches.agreeing(torch.stack([T, other, *off]))
-    assert float(counts[:2].min()) >= FitSettings().min_keypoints
+    assert counts[:2].min() >= FitSettings().min_keypoints
     # about what a view of the mesh has, in which the print is in full view
-    assert 0.5 * matches.per_view < float(counts[:2].min()) < matches.per_view
-    assert float(counts[2:].max()) < 0.5 * float(counts[0])
+    assert 0.5 * matches.per_view < counts[:2].min() < matches.per_view
+    assert counts[2:].max() < 0.5 * float(counts[0])
     twice = replace(
         matches, uv=matches.uv.repeat(2, axis=0), points=matches.points.repeat(2, axis=0)
     )
@@ -179,7 +180,7 @@ def test_keypoints_decide_where_most_of_the_object_is_hidden():
         :, int(box[1] + 0.4 * (box[3] - box[1])) :
     ]
     result = cr.Registrar(mesh(), views=around, mesh_is="exact")([image], box[None], K)[0]
-    assert float(rotation_error(result.rotation, T[:3, :3])) < 5.0
+    assert rotation_error(result.rotation, T[:3, :3]) < 5.0
     assert result.hypotheses[0].evidence["keypoints"] > max(
         h.evidence["keypoints"] for h in result.hypotheses[1:]
     )
@@ -190,7 +191,7 @@ def test_a_fit_that_leaves_the_keypoints_is_not_kept(monkeypatch):
 
     def fit_elsewhere(describer, crops, poses, **options):
         fitted = fit_poses(describer, crops, poses, **options)
-        twist = torch.tensor([[0.0, 0.0, 1.5, 0.0, 0.0, 0.0]], dtype=torch.float64)
+        twist = double([[0.0, 0.0, 1.5, 0.0, 0.0, 0.0]])
         return placed(
             fitted,
             apply_twist(fitted.T, twist.expand(len(fitted), 6), describer.centre),
@@ -200,7 +201,7 @@ def test_a_fit_that_leaves_the_keypoints_is_not_kept(monkeypatch):
     monkeypatch.setattr(block, "fit_poses", fit_elsewhere)
     monkeypatch.setattr(stages, "fit_texture_of", lambda *_: None)
     result = registrar()([photograph(T)], box_of(T)[None], K)[0]
-    assert float(rotation_error(result.rotation, T[:3, :3])) < 3.0
+    assert rotation_error(result.rotation, T[:3, :3]) < 3.0
     assert result.edge_support > 0.0
     assert result.covariance is not None
 
@@ -221,11 +222,11 @@ def test_a_pose_needs_enough_keypoints_at_different_places():
 def test_origin_of_the_mesh_may_be_far_away():
     """Behind the camera, and a thousand object radii off."""
     T = pose(20.0, 0.4, 4.0)
-    away = torch.tensor([0.0, 0.0, 1000.0], dtype=torch.float64)
+    away = double([0.0, 0.0, 1000.0])
     moved = as_mesh(carton().apply_translation(away.numpy()))
     (found,) = Keypoints(ViewDescriber(moved, BankSettings())).matches(photograph(T), K).poses()
-    assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 2.0
-    assert float((found.T[:3, :3] @ away + found.T[:3, 3] - T[:3, 3]).norm()) < 0.02 * 4.0
+    assert rotation_error(found.T[:3, :3], T[:3, :3]) < 2.0
+    assert (found.T[:3, :3] @ away + found.T[:3, 3] - T[:3, 3]).norm() < 0.02 * 4.0
 
 
 @cache
@@ -241,9 +242,9 @@ def test_registration_starts_from_keypoints_too(monkeypatch):
     T = pose(65.0, 0.4, 4.0)
     image = photograph(T)
     box = box_of(T)
-    assert float(rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3])) < 1.0
+    assert rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3]) < 1.0
     monkeypatch.setattr(KeypointMatches, "poses", lambda *_: [])
-    assert float(rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3])) > 10.0
+    assert rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3]) > 10.0
 
 
 def test_a_pose_outside_the_limits_is_no_start():

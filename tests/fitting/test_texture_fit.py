@@ -27,13 +27,12 @@ from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.contours import MeshContours
 from tests._support.cans import can, photograph
+from tests._support.numbers import double
 from tests._support.scenes import CAMERA
 
 MESH = can()
-R = rotation_from_viewpoint(*torch.tensor((17.0, 22.0, 0.0), dtype=torch.float64)) @ up_rotation(
-    "y"
-)
-TRUTH = transform(R[None], torch.tensor([[0.1, -0.05, 7.0]], dtype=torch.float64))
+R = rotation_from_viewpoint(*double((17.0, 22.0, 0.0))) @ up_rotation("y")
+TRUTH = transform(R[None], double([[0.1, -0.05, 7.0]]))
 CENTRE = mesh_centre(MESH)
 CONTOURS = MeshContours(MESH)
 
@@ -68,9 +67,8 @@ def error(found):
 @pytest.mark.parametrize("degrees", [-12.0, -5.0, 5.0, 12.0])
 def test_label_determines_the_rotation_about_the_axis(renderer, degrees):
     found = fit(renderer, photograph(MESH, TRUTH), turned_can(degrees))
-    assert found is not None
     assert error(found) < 1.0
-    assert float((found.transform - TRUTH)[0, :3, 3].norm()) < 0.01 * 7.0
+    assert (found.transform - TRUTH)[0, :3, 3].norm() < 0.01 * 7.0
     assert int(found.observable) == 6
     about_axis = R[:, 1] @ found.covariance[0, :3, :3] @ R[:, 1]
     assert float(about_axis.sqrt().rad2deg()) < 10.0
@@ -92,9 +90,7 @@ def test_can_that_is_turned_far_is_found_from_turned_starts(renderer):
 
 
 def test_turned_starts_need_an_axis_that_contours_do_not_determine():
-    covariance = torch.diag(torch.tensor([0.1, 9.0, 0.1, 1e-4, 1e-4, 1e-4], dtype=torch.float64))[
-        None
-    ]
+    covariance = torch.diag(double([0.1, 9.0, 0.1, 1e-4, 1e-4, 1e-4]))[None]
 
     def contours(covariance, observable):
         return ContourFit(
@@ -105,10 +101,8 @@ def test_turned_starts_need_an_axis_that_contours_do_not_determine():
     assert rotated_starts(contours(covariance * torch.nan, 0), CENTRE).equal(TRUTH)
     starts = rotated_starts(contours(covariance, 5), CENTRE)
     assert rotation_error(starts[:, :3, :3], R).round().tolist() == [0, 16, 16]
-    assert torch.allclose(
-        (starts[1, :3, :3] @ R.mT)[1], torch.tensor([0.0, 1, 0], dtype=torch.float64)
-    )
-    assert float(rotation_error(starts[1, :3, :3], starts[2, :3, :3])) == pytest.approx(32.0)
+    assert torch.allclose((starts[1, :3, :3] @ R.mT)[1], double([0.0, 1, 0]))
+    assert rotation_error(starts[1, :3, :3], starts[2, :3, :3]) == pytest.approx(32.0)
 
 
 @pytest.mark.parametrize("shown", ["grey", "nothing"])
@@ -125,25 +119,24 @@ def test_fit_may_lose_a_little_edge_support(monkeypatch, renderer, after, counts
     assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
 
 
-@pytest.mark.parametrize(("before", "counts"), [(1.0, False), (0.0, True)])
-def test_fit_must_find_more_corners_than_the_start(monkeypatch, renderer, before, counts):
-    search = _TextureRounds.round
-    monkeypatch.setattr(
-        _TextureRounds, "round", lambda *given: replace(search(*given), before=before)
-    )
-    assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
-
-
 @pytest.mark.parametrize(
-    ("coarse", "fine", "counts"), [(0.02, 0.5, False), (0.04, 0.14, False), (0.04, 0.16, True)]
+    ("before", "coarse", "fine", "counts"),
+    [
+        (1.0, 0.5, 0.5, False),  # no more than the start
+        (0.0, 0.02, 0.5, False),
+        (0.0, 0.04, 0.14, False),
+        (0.0, 0.04, 0.16, True),
+    ],
 )
-def test_fit_must_find_enough_corners(monkeypatch, renderer, coarse, fine, counts):
+def test_fit_must_find_enough_corners_and_more_than_the_start(
+    monkeypatch, renderer, before, coarse, fine, counts
+):
     search = _TextureRounds.round
     ratios = iter([coarse, fine])
     monkeypatch.setattr(
         _TextureRounds,
         "round",
-        lambda *given: replace(search(*given), before=0.0, after=next(ratios)),
+        lambda *given: replace(search(*given), before=before, after=next(ratios)),
     )
     assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
 
@@ -158,7 +151,7 @@ def test_label_does_not_pull_a_pose_out_of_its_limits():
     free, limited = (
         registrar([photograph(MESH, TRUTH)], box, CAMERA, prior=p)[0] for p in (None, prior)
     )
-    assert float(rotation_error(free.rotation, R)) < 1.0
+    assert rotation_error(free.rotation, R) < 1.0
     assert float(prior.excess(limited.rotation)) <= 3.0
     assert limited.hypotheses[0].covariance is not None, "its contours are fitted"
 

@@ -196,10 +196,8 @@ FIVE = {"k1": -0.31, "k2": 0.12, "p1": 0.001, "p2": -0.002, "k3": 0.03}
 FOUR = {key: value for key, value in FIVE.items() if key != "k3"}
 LENS = D[0].tolist()
 MATRIX = K.tolist()
-TRANSPOSED = K.T.flatten().tolist()
 SIZE = {"width": 640, "height": 480}
 CORNER = {"fl_x": 520.5, "fl_y": 522.0, "cx": 321.75, "cy": 239.0, "w": 640, "h": 480}
-FRAME = {"file_path": "images/1.jpg", "transform_matrix": np.eye(4).tolist()}
 OWN = {"matrix": MATRIX, "distortion": LENS[:4], "model": "radial-tangential", "size": [480, 640]}
 
 JSON = {

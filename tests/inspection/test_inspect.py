@@ -35,6 +35,7 @@ from curvireg_torch.mesh import has_colours
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.registration import Registrar
 from curvireg_torch.synthetic import example_mesh
+from tests._support.numbers import double
 from tests._support.quick import slow_after
 
 
@@ -192,9 +193,9 @@ def test_a_half_hollow_box_looks_alike_from_above_and_not_from_below():
     )
     alike = torch.tensor([pair.is_alike for pair in pairs])
     angle = torch.tensor([pair.angle for pair in pairs])
-    assert bool(alike[elevation > 30].all())
-    assert float(alike[elevation < -40].double().mean()) == 0.0
-    assert bool((angle[elevation > 30] > 170).all()), "half a turn away"
+    assert alike[elevation > 30].all()
+    assert alike[elevation < -40].double().mean() == 0.0
+    assert (angle[elevation > 30] > 170).all(), "half a turn away"
 
 
 def test_look_alikes_leave_out_symmetries():
@@ -368,8 +369,8 @@ def pair_of(rotation, rival, **more):
 
 def test_sides_that_are_confused_are_named():
     view = cr.rotation_from_viewpoint(20.0, 30.0, 0.0).double()
-    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-    upside_down = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    half_turn = torch.diag(double([-1.0, -1.0, 1.0]))
+    upside_down = torch.diag(double([1.0, -1.0, -1.0]))
     around = pair_of(view, view @ half_turn)
     over = pair_of(view, view @ upside_down)
     quarter = pair_of(view, cr.rotation_from_viewpoint(110.0, 30.0, 0.0).double())
@@ -382,7 +383,7 @@ def test_sides_that_are_confused_are_named():
 def test_one_sentence_says_what_looks_alike_and_what_helps():
     facts = mesh_facts(example_mesh())
     view = cr.rotation_from_viewpoint(20.0, 30.0, 0.0).double()
-    turned = view @ torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    turned = view @ torch.diag(double([-1.0, -1.0, 1.0]))
     alike = pair_of(view, turned, hint="--azimuth")
     other = LookAlike(view, turned, 180.0, 0.2, 0.8)
     brief = Inspection(facts, (alike, alike, alike, *[other] * 7)).in_brief
@@ -412,7 +413,7 @@ def test_a_print_tells_sides_of_a_box_apart_and_a_plain_one_does_not():
         mesh = as_mesh(box)
         bank = ViewBank.build(mesh, views, progress=False)
         describer = Registrar(bank, mesh_is="exact").describer
-        half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+        half_turn = torch.diag(double([-1.0, -1.0, 1.0]))
         view = cr.rotation_from_viewpoint(60.0, 20.0, 0.0).double()
         distance = bank.distances.median().double().cpu()
         sides[name] = print_difference(describer, view, view @ half_turn, distance)

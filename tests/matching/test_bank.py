@@ -231,7 +231,7 @@ def test_float16_storage_changes_no_ranking(small_bank, saved):
     exact, stored = (
         Correlation().build(bank)(query) for bank in (small_bank, ViewBank.load(saved))
     )
-    assert float((exact - stored).abs().max()) < 1e-4
+    assert (exact - stored).abs().max() < 1e-4
     assert torch.equal(exact.argmax(dim=1), stored.argmax(dim=1))
 
 

@@ -120,7 +120,7 @@ def test_mask_decides_which_edges_are_the_outline():
     query = register.matcher.query([image], box[None])
     crop = register.object_mask(query, [as_photograph(image, box, CAMERA, mask=mask)])
     assert crop.shape == (1, 1, 96, 96)
-    assert 0.3 < float(crop.mean()) < 0.7
+    assert 0.3 < crop.mean() < 0.7
     assert register.object_mask(query, [as_photograph(image, box, CAMERA)]) is None
 
 
@@ -136,7 +136,7 @@ def test_a_given_mask_replaces_the_predicted_one_of_the_box():
     torch.testing.assert_close(
         predicted, register.matcher.field.mask(query.crops), atol=1e-4, rtol=0
     )
-    assert float(register.object_mask(query, [given]).min()) == 1.0
+    assert register.object_mask(query, [given]).min() == 1.0
 
 
 def test_masks_in_any_form_are_read_and_unusable_ones_named(tmp_path):

@@ -26,6 +26,7 @@ from curvireg_torch.registration.detection import Candidate, Found, _add, _allow
 from curvireg_torch.registration.photograph import Photograph
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from curvireg_torch.visualization.words import corners
+from tests._support.numbers import double
 from tests._support.scenes import CAMERA, scene, unrefined
 
 SIZE = (240, 320)
@@ -132,7 +133,7 @@ def test_detection_with_camera_and_distance(registrar):
 
 
 def test_pose_outside_the_photograph_has_score_zero(registrar, found, monkeypatch):
-    outside = torch.tensor([-300.0, -200.0, -100.0, -50.0], dtype=torch.float64)
+    outside = double([-300.0, -200.0, -100.0, -50.0])
     monkeypatch.setattr(detection_module, "projected_box", lambda *_: outside)
     result = registrar([found[0]])[0]
     assert result.ok
@@ -258,11 +259,11 @@ def test_detector_does_not_compare_views_that_the_prior_excludes(registrar, foun
         viewpoint_from_rotation(bank().rotations[allowed])[0].round().unique().tolist()
     ) == [180.0, 210.0]
     located = registrar.detector(image, allowed=allowed)
-    assert bool(allowed[located.views].all()), "each view of this small bank is its own template"
+    assert allowed[located.views].all(), "each view of this small bank is its own template"
     assert set(result.detection.responses.tolist()) <= set(located.responses.tolist())
     everything = registrar.detector(image, allowed=torch.ones_like(allowed))
     assert torch.equal(everything.boxes, registrar.detector(image).boxes)
-    assert not bool(allowed[everything.views].all())
+    assert not allowed[everything.views].all()
 
 
 def test_allowed_views_are_those_of_any_place_in_the_photograph(registrar):
@@ -308,8 +309,8 @@ def test_distance_limits_each_box_by_its_view():
     sides = (boxes[:, 2:] - boxes[:, :2]).amax(dim=1) * bank().distances[views]
     away = sides * FOCAL / (located.boxes[:, 2:] - located.boxes[:, :2]).amax(dim=1)
     assert len(away) > 5
-    assert float(away.min()) > low / 2.0**0.25 * 0.9
-    assert float(away.max()) < high * 2.0**0.25 * 1.1
+    assert away.min() > low / 2.0**0.25 * 0.9
+    assert away.max() < high * 2.0**0.25 * 1.1
 
 
 def test_detector_rejects_bad_distances_images_and_settings():
@@ -340,8 +341,8 @@ def test_boxes_of_peaks_are_exact():
         similarity[k, i, j] = 1.0
         best = detector()._peaks([similarity], [torch.ones(len(views), dtype=torch.bool)], [ratio])
         # The template's centre, 47.5 px, is 8 j px from the left border of the resized photograph.
-        centre = torch.tensor([8.0 * j, 8.0 * i] * 2, dtype=torch.float64)
-        expected = (drawn[k] - 47.5 + centre) / torch.tensor(ratio * 2, dtype=torch.float64) - 0.5
+        centre = double([8.0 * j, 8.0 * i] * 2)
+        expected = (drawn[k] - 47.5 + centre) / double(ratio * 2) - 0.5
         torch.testing.assert_close(best.boxes[0].double(), expected, rtol=0, atol=0.01)
         assert int(best.views[0]) == int(views[k])
 

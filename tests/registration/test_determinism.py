@@ -48,7 +48,7 @@ def numbers(result):
 
 def check_agreement(one, other):
     """To .05 degrees, and .01 of confidence."""
-    assert float(rotation_error(one.rotation, other.rotation)) < 0.05
+    assert rotation_error(one.rotation, other.rotation) < 0.05
     assert other.confidence == pytest.approx(one.confidence, abs=0.01)
     assert other.verdict == one.verdict
 

@@ -16,6 +16,7 @@ from curvireg_torch.geometry.cameras import pose_around
 from curvireg_torch.registration import FailedRegistration, Follower, refine, tracking
 from curvireg_torch.registration.tracking import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
+from tests._support.numbers import double
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, sequence, truck_registrar
 
@@ -117,9 +118,7 @@ def test_registrations_that_disagree_are_not_followed(monkeypatch, degrees, part
         T, K = found.projection
         calls.append(T)
         if len(calls) == 2:
-            turn = rotation_from_axis_angle(
-                torch.deg2rad(torch.tensor([0.0, degrees, 0.0], dtype=torch.float64))
-            )
+            turn = rotation_from_axis_angle(torch.deg2rad(double([0.0, degrees, 0.0])))
             at = (T[:3, :3] @ centre + T[:3, 3]) * (1.0 + part)
             moved = pose_around(turn @ T[:3, :3], at, centre)
             first = replace(found.hypotheses[0], projection=(moved, K))
@@ -157,7 +156,7 @@ def test_confidence_is_a_fraction_of_that_of_the_first_pose_and_not_raised_by_th
 def test_a_wrong_start_never_becomes_believed():
     """Seen from behind, in frame after frame; a registration of each frame does not confirm it."""
     frames = sequence(2)
-    behind = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+    behind = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
     follow = Follower(learned_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2] @ behind)
     follow._base = 0.45  # doubtful
@@ -208,9 +207,7 @@ def test_follower_refines_where_tracking_is_doubtful(monkeypatch):
     """The object jumps by 11 degrees and a tenth of its distance."""
     image, _, T = sequence(1)[0]
     jumped = T.clone()
-    jumped[:3, :3] = (
-        rotation_from_axis_angle(torch.tensor([0.0, 0.2, 0.0], dtype=torch.float64)) @ T[:3, :3]
-    )
+    jumped[:3, :3] = rotation_from_axis_angle(double([0.0, 0.2, 0.0])) @ T[:3, :3]
     jumped[0, 3] += 0.1 * T[2, 3]
     there = synthesize_photograph(
         example_mesh(), jumped, CAMERA, SIZE, torch.Generator().manual_seed(9)

@@ -31,7 +31,7 @@ def photographs(count):
 def check_agreement(results, expected):
     for result, other in zip(results, expected, strict=True):
         assert result.ok
-        assert float(cr.rotation_error(result.rotation, other.rotation)) < AGREES
+        assert cr.rotation_error(result.rotation, other.rotation) < AGREES
         assert result.confidence == pytest.approx(other.confidence, abs=0.01)
 
 
@@ -60,7 +60,7 @@ def test_a_bank_of_another_device_has_the_same_views(elsewhere):
     assert float(differs) < 1e-3
     torch.testing.assert_close(other.boxes.cpu(), bank.boxes)
     error = (other.descriptors.cpu() - bank.descriptors).abs()
-    assert float((error > 5e-3).float().mean()) < 1e-3  # a pixel of an edge more or less
+    assert (error > 5e-3).float().mean() < 1e-3  # a pixel of an edge more or less
     images, boxes = photographs(1)
     found = cr.Registrar(other)(images, boxes, CAMERA)
     check_agreement(found, cr.Registrar(bank)(images, boxes, CAMERA))

@@ -53,8 +53,8 @@ def test_poses_fill_their_box():
     again = Hypotheses.in_boxes(
         describer, box[None], CAMERA[None], exact.rotation, exact.distance, none, none
     )
-    assert float(rotation_error(again.T[0, :3, :3], T[:3, :3])) < 2.0
-    assert float((again.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.03
+    assert rotation_error(again.T[0, :3, :3], T[:3, :3]) < 2.0
+    assert ((again.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.03
     torch.testing.assert_close(
         again.distance, (again.T[0, :3, :3] @ describer.centre + again.T[0, :3, 3]).norm()[None]
     )

@@ -18,6 +18,7 @@ from curvireg_torch.geometry.pose_prior import PosePrior
 from curvireg_torch.registration.block import Limits
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.photograph import Photograph
+from tests._support.numbers import double
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, learned_registrar, scene, truck_bank, truck_registrar
 
@@ -44,7 +45,7 @@ def test_each_photograph_has_its_own_prior_which_may_leave_no_view():
     registrar = truck_registrar()
     priors = [None, around(AZIMUTH + 180.0, 40.0), PosePrior(elevation=(85, 90), theta=(90, 91))]
     free, limited, failed = registrar([IMAGE] * 3, BOX.repeat(3, 1), CAMERA, prior=priors)
-    assert float(rotation_error(free.rotation, TRUTH)) < 5.0
+    assert rotation_error(free.rotation, TRUTH) < 5.0
     assert float(priors[1].excess(limited.rotation)) <= 3.0
     assert not failed.ok
     assert "no view of the bank" in str(failed.error)
@@ -61,13 +62,13 @@ def test_limits_hold_in_the_camera_of_the_photograph():
     """It sees a box at the border 25 degrees off its axis."""
     bank = truck_bank()
     box = (200.0, 20.0, 238.0, 60.0)
-    ray = torch.linalg.solve(CAMERA, torch.tensor([219.0, 40.0, 1.0], dtype=torch.float64))
+    ray = torch.linalg.solve(CAMERA, double([219.0, 40.0, 1.0]))
     R = rotation_towards(ray) @ bank.rotations[5].double()
     allowed = limits_of(PosePrior(rotation=R, within=0.1), box).allowed()
     distances = rotation_error(bank.rotations.double(), bank.rotations[5].double())
-    assert bool(allowed[5])
-    assert not bool(allowed[distances > 7.7].any())
-    assert bool(allowed[distances < 7.5].all())
+    assert allowed[5]
+    assert not allowed[distances > 7.7].any()
+    assert allowed[distances < 7.5].all()
 
 
 def pose_at(away=1.5, degrees=0.0):
@@ -76,13 +77,8 @@ def pose_at(away=1.5, degrees=0.0):
     index = torch.zeros(1, dtype=torch.long)
     one = torch.ones(1, dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)[None].clone()
-    pose[0, :3, :3] = rotation_from_axis_angle(
-        torch.tensor([0.0, 0.0, math.radians(degrees)], dtype=torch.float64)
-    )
-    pose[0, :3, 3] = (
-        away * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
-        - pose[0, :3, :3] @ describer.centre
-    )
+    pose[0, :3, :3] = rotation_from_axis_angle(double([0.0, 0.0, math.radians(degrees)]))
+    pose[0, :3, 3] = away * double([0.6, 0.0, 0.8]) - pose[0, :3, :3] @ describer.centre
     return Hypotheses.at(pose, CAMERA[None], describer.centre, index, one)
 
 
@@ -116,7 +112,7 @@ def test_poses_are_turned_into_all_limits_about_their_centre():
         0.0 * view,
     )
     moved = limits.moved_inside(poses)
-    assert float(COMBINED.excess(moved.T[:, :3, :3]).max()) < 0.01
+    assert COMBINED.excess(moved.T[:, :3, :3]).max() < 0.01
     assert limits.moved_inside(moved).T.equal(moved.T)
     before, after = (P[:, :3, :3] @ describer.centre + P[:, :3, 3] for P in (poses.T, moved.T))
     torch.testing.assert_close(before, after)
@@ -139,7 +135,7 @@ def test_only_rival_outside_tells_whether_a_tight_right_hint_is_wrong():
     registrar = learned_registrar()
     free = registrar(*ONE)[0]
     tight = registrar(*ONE, prior=PosePrior(rotation=TRUTH, within=6.0))[0]
-    assert float(rotation_error(tight.rotation, TRUTH)) < 5.0
+    assert rotation_error(tight.rotation, TRUTH) < 5.0
     assert tight.prior_contradiction is None
     assert tight.confidence > 0.5
     assert tight.confidence >= free.confidence - 0.1

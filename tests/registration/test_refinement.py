@@ -10,6 +10,7 @@ from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, transform
 from curvireg_torch.registration import refinement
 from curvireg_torch.synthetic import procedural_background, synthesize_photograph
+from tests._support.numbers import double
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_bank
 
@@ -21,9 +22,7 @@ def registrar():
 
 def moved(T, degrees=0.0, distance=0.0, axis=(0.6, 0.0, 0.8)):
     out = T.clone()
-    vector = torch.tensor(axis, dtype=torch.float64) * torch.deg2rad(
-        torch.tensor(degrees, dtype=torch.float64)
-    )
+    vector = double(axis) * torch.deg2rad(double(degrees))
     out[:3, :3] = rotation_from_axis_angle(vector) @ T[:3, :3]
     out[:3, 3] *= 1.0 + distance
     return out
@@ -55,7 +54,7 @@ def test_refine_reports_the_best_of_several_starts(registrar):
     result = registrar.refine([image], CAMERA, [starts])[0]
     assert errors(result, T)[0] < 2.0
     assert result.edge_support == max(h.edge_support for h in result.hypotheses)
-    assert float(rotation_error(result.hypotheses[-1].rotation, T[:3, :3])) > 90.0
+    assert rotation_error(result.hypotheses[-1].rotation, T[:3, :3]) > 90.0
 
 
 @pytest.mark.parametrize("seed", slow_after(1, range(3)))
@@ -99,7 +98,7 @@ def test_refine_calls_the_object_lost_below_its_limit(registrar, monkeypatch, co
     assert registrar.refine([image], CAMERA, [T])[0].ok is ok
 
 
-TURNED = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+TURNED = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
 
 
 def test_a_half_turn_does_not_become_believed_by_being_refined():
@@ -122,7 +121,7 @@ def test_poses_that_look_alike_are_confirmed_by_the_same_registration():
     views = cr.sample_views(azimuth_step=30, elevations=[0, 30, 60])
     registrar = cr.Registrar(cr.ViewBank.build(mesh, views, image_size=96, progress=False))
     R = cr.rotation_from_viewpoint(30.0, 30.0, 0.0).double()
-    T = transform(R, torch.tensor([0.0, 0.0, 1.2], dtype=torch.float64))
+    T = transform(R, double([0.0, 0.0, 1.2]))
     image, _ = synthesize_photograph(mesh, T, CAMERA, SIZE, torch.Generator().manual_seed(0))
     symmetries = registrar.symmetries_of(exact=True).double()
     assert len(symmetries) == 4

@@ -2,29 +2,29 @@
 pose."""
 
 import math
-from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evidence import Evidence
 from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import rig as rig_module
 from curvireg_torch.registration.rig import ELSEWHERE, Rig, RigPhotograph, RigProblem
+from tests._support.hypotheses import evidence_of
+from tests._support.numbers import double
 
 LOST_CONFIDENCE = Pipeline().fit.lost_confidence
-CENTRE = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
+CENTRE = double([0.2, -0.1, 0.3])
 RADIUS = 2.0
 ORIGIN = torch.eye(4, dtype=torch.float64)
 
 
 def turned(*degrees, shift=0.0):
     """(N, 4, 4) world poses about the z axis through the object's centre."""
-    angles = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    angles = torch.deg2rad(double(degrees))
     R = rotation_from_axis_angle(angles[:, None] * torch.tensor([0.0, 0.0, 1.0]).double())
     moved = torch.tensor([shift, 0.0, 0.0]).double() + CENTRE
     return transform(R, moved - (R @ CENTRE))
@@ -43,7 +43,7 @@ def rig_of(eyes, **attributes):
 
 
 def around(*degrees, distance=10.0):
-    angles = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    angles = torch.deg2rad(double(degrees))
     return distance * torch.stack([angles.cos(), angles.sin(), 0.0 * angles], dim=1)
 
 
@@ -67,7 +67,7 @@ def test_a_photograph_knows_the_place_across_its_ray_better_than_along_it():
     precision = rig_of(around(0.0)).precision(place, torch.zeros(1, dtype=torch.long))[0]
     along = rig_module.DEPTH_ERROR * 10.0
     across = math.hypot(rig_module.CENTRE_ERROR * RADIUS, rig_module.RIG_ERROR * 10.0)
-    expected = torch.diag(torch.tensor([along, across, across], dtype=torch.float64) ** -2.0)
+    expected = torch.diag(double([along, across, across]) ** -2.0)
     torch.testing.assert_close(precision, expected)
     assert along > across
 
@@ -84,7 +84,7 @@ def test_candidates_that_are_nearly_equal_count_once():
             turned(180.0),
         ]
     )
-    score = torch.tensor([6.0, 5.0, 4.0, 3.0, 2.0, 1.0], dtype=torch.float64)
+    score = double([6.0, 5.0, 4.0, 3.0, 2.0, 1.0])
     rig = rig_of(around(0.0))
     assert rig.distinct(T, score).tolist() == [0, 2, 4, 5]
     assert rig.distinct(T, -score).tolist() == [5, 4, 2, 0]
@@ -95,12 +95,6 @@ def test_candidates_that_are_nearly_equal_count_once():
 
 def photograph(index, sees):
     return SimpleNamespace(index=index, sees=lambda _, T: torch.tensor([sees] * len(T)))
-
-
-def evidence_of(*similarity):
-    nothing = torch.zeros(len(similarity), 1, dtype=torch.float64)
-    values = Evidence(*[nothing] * len(fields(Evidence)))
-    return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64)[:, None])
 
 
 @pytest.mark.parametrize(
@@ -119,7 +113,9 @@ def test_photographs_that_do_not_show_the_pose_are_named(monkeypatch, sees, simi
     monkeypatch.setattr(rig_module, "refinement_confidence", lambda known: known["similarity"])
     photographs = [photograph(index, seen) for index, seen in zip((3, 5, 8), sees, strict=True)]
     rig = rig_of(around(0.0, 90.0, 180.0), photographs=photographs)
-    answer = SimpleNamespace(evidence=evidence_of(*similarity), T=ORIGIN[None])
+    answer = SimpleNamespace(
+        evidence=evidence_of(similarity=[[value] for value in similarity]), T=ORIGIN[None]
+    )
     reasons = rig.lost(answer)
     assert sorted(reasons) == lost
     for index, reason in reasons.items():
@@ -160,7 +156,7 @@ def test_unknown_covariances_have_nearly_no_precision():
     both = torch.stack([known, torch.full((6, 6), torch.nan).double()])
     precision = rig_module._inverse(both)
     torch.testing.assert_close(precision[0], torch.linalg.inv(known))
-    assert 0.0 < float(precision[1].diagonal().max()) < 1e-9
+    assert 0.0 < precision[1].diagonal().max() < 1e-9
 
 
 def test_a_pose_is_seen_where_its_box_overlaps_that_of_the_photograph(monkeypatch):

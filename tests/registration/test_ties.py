@@ -106,7 +106,7 @@ def test_poses_that_the_shape_makes_equal_are_rivals_where_a_small_feature_diffe
     assert len(mesh_symmetries(mesh)) == 4
     result, _ = registered(registrar_of(mesh), azimuth, 35.0, int(azimuth))
     turned = result.rotation @ mesh_symmetries(mesh)[1:, :3, :3]
-    assert float(rotation_error(turned, result.hypotheses[1].rotation).min()) < 10.0
+    assert rotation_error(turned, result.hypotheses[1].rotation).min() < 10.0
 
 
 @pytest.mark.parametrize(("side", "notable"), [(14.0, False), (24.0, True)])
@@ -137,7 +137,7 @@ def test_given_symmetries_are_trusted():
     result, _ = registered(Registrar(bank, symmetries=group), 20.0, 35.0, 20)
     turned = result.rotation @ group[1:, :3, :3].double()
     for hypothesis in result.hypotheses[1:]:
-        assert float(rotation_error(turned, hypothesis.rotation).min()) > 10.0
+        assert rotation_error(turned, hypothesis.rotation).min() > 10.0
 
 
 def test_telling_symmetries_are_those_that_a_feature_breaks():
@@ -148,7 +148,7 @@ def test_telling_symmetries_are_those_that_a_feature_breaks():
     group = mesh_symmetries(marked_box())
     fractions = feature_fractions(marked_box(), group)
     assert fractions[0] == 0.0
-    assert bool((fractions[1:] > FEATURE_FRACTION).all())
+    assert (fractions[1:] > FEATURE_FRACTION).all()
     telling = telling_symmetries(marked_box(), group)
     assert torch.equal(telling.transforms[0], torch.eye(4).double())
     assert len(telling) == 4
@@ -161,4 +161,4 @@ def test_spread_keeps_few_symmetries_far_apart():
     apart = rotation_error(some[:, None, :3, :3], some[None, :, :3, :3]) + 360.0 * torch.eye(
         MAX_SIBLINGS
     )
-    assert float(apart.min()) >= 30.0
+    assert apart.min() >= 30.0

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evidence import Evidence, EvidenceWeights
+from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.fitting.focal_length import (
     USUAL_FOCAL,
     FocalInformation,
@@ -22,6 +22,7 @@ from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.block import Block
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.photograph import Photograph
+from tests._support.hypotheses import evidence_of
 from tests._support.numbers import double
 from tests._support.scenes import CAMERA, SIZE
 
@@ -36,12 +37,6 @@ def poses_at(count, *, K=CAMERA, rank=None):
     T = transform(R, torch.tensor([0.1, 0.0, 5.0]).double().expand(count, 3))
     ranks = double(rank or [0.0] * count)
     return Hypotheses.at(T, K.expand(count, 3, 3), CENTRE, torch.arange(count), ranks)
-
-
-def evidence_of(*similarity):
-    nothing = torch.zeros(len(similarity), dtype=torch.float64)
-    values = Evidence(*[nothing] * len(fields(Evidence)))
-    return replace(values, similarity=double(similarity))
 
 
 def test_cameras_that_are_tried_have_all_fields_of_view():

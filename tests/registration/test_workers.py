@@ -27,7 +27,7 @@ def test_processes_give_the_results_of_one_in_the_same_order(tmp_path):
     for one, again, other in zip(*both, expected, strict=True):
         if other.ok:  # one process registers them in one block, which changes rounding
             assert torch.equal(one.transform, again.transform)
-            assert float(rotation_error(one.rotation, other.rotation)) < 0.05
+            assert rotation_error(one.rotation, other.rotation) < 0.05
             assert one.translation.tolist() == pytest.approx(other.translation.tolist(), rel=1e-3)
             assert one.score == pytest.approx(other.score, abs=1e-3)
         else:

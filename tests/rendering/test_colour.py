@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-import torch
 import trimesh
 from PIL import Image
 
@@ -8,6 +7,7 @@ from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import has_colours, load_mesh, surface_colours
 from curvireg_torch.mesh.colours import colours_at
 from curvireg_torch.rendering import make_renderer, render_colour, shade
+from tests._support.numbers import double
 
 COLOURS = [
     (230, 20, 20),
@@ -18,14 +18,12 @@ COLOURS = [
     (220, 20, 230),
 ]
 SIZE = (72, 96)
-K = torch.tensor([[150.0, 0, 47.5], [0, 150.0, 35.5], [0, 0, 1]], dtype=torch.float64)
+K = double([[150.0, 0, 47.5], [0, 150.0, 35.5], [0, 0, 1]])
 
 
 def camera(azimuth, elevation, theta=0.0, distance=5.0):
-    R = rotation_from_viewpoint(
-        *(torch.tensor([a], dtype=torch.float64) for a in (azimuth, elevation, theta))
-    )
-    return transform(R, torch.tensor([[0.0, 0.0, distance]], dtype=torch.float64))
+    R = rotation_from_viewpoint(*(double([a]) for a in (azimuth, elevation, theta)))
+    return transform(R, double([[0.0, 0.0, distance]]))
 
 
 def textured_box():
@@ -104,8 +102,8 @@ def test_render_colour_is_grey_without_colours_or_faces():
     assert has_colours(mesh)
     assert not has_colours(bare)
     grey = render_colour(bare, T, K, SIZE)
-    assert bool((grey[:, 0] == grey[:, 1]).all())
-    assert float((grey - render_colour(mesh, T, K, SIZE)).abs().mean()) > 0.05
+    assert (grey[:, 0] == grey[:, 1]).all()
+    assert (grey - render_colour(mesh, T, K, SIZE)).abs().mean() > 0.05
     assert render_colour(mesh, T[:0], K, SIZE).shape == (0, 3, *SIZE)
 
 
@@ -151,7 +149,6 @@ def test_load_mesh_reads_textures_and_materials(tmp_path, suffix):
     scene.export(path)
     mesh = load_mesh(path, up="z")
     colours = surface_colours(mesh)
-    assert colours is not None
     assert len(colours) == len(mesh.faces) == 24
     assert len(colours.textures) == 1
     is_red = mesh.triangles_center[:, 0] > 1.0

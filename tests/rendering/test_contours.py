@@ -51,19 +51,19 @@ def test_contours_do_not_depend_on_the_unit(unit):
     one = contour_points(1.0)
     same = contour_points(unit)
     agree = (one.valid == same.valid) & (one.outline == same.outline)
-    assert float(agree.double().mean()) > 0.98
+    assert agree.double().mean() > 0.98
     both = one.valid & same.valid
     apart = (same.model / unit - one.model).norm(dim=-1)[both]
-    assert float((apart < 1e-3).double().mean()) > 0.95
+    assert (apart < 1e-3).double().mean() > 0.95
     turned = (same.normals * one.normals).sum(dim=-1).abs()[both]
-    assert float((turned > 0.99).double().mean()) > 0.95
+    assert (turned > 0.99).double().mean() > 0.95
 
 
 def test_every_view_has_creases_beside_its_occluding_contours():
     points = contour_points(1.0)
     creases = points.valid[:, MAX_OCCLUDING:].sum(dim=1)
-    assert int(creases.min()) > 10
-    assert not bool(points.outline[:, MAX_OCCLUDING:].any())
+    assert creases.min() > 10
+    assert not points.outline[:, MAX_OCCLUDING:].any()
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1.0, 80.0])
@@ -79,7 +79,7 @@ def test_edges_that_reach_behind_the_camera_have_no_points(unit):
     model = points.model[points.valid] / unit
     assert len(model) > 20
     depth = model[:, 2]
-    assert float(depth.min()) > 4.9, "the far end of the bar, and the plate"
+    assert depth.min() > 4.9, "the far end of the bar, and the plate"
 
 
 @pytest.mark.parametrize("inside_out", [False, True])
@@ -93,7 +93,7 @@ def test_normals_of_outlines_point_away_from_the_object(inside_out):
     radial = model[:, :2] / model[:, :2].norm(dim=1, keepdim=True)
     cosine = (points.normals[points.outline] * radial).sum(dim=1)
     assert len(model) > 100
-    assert float(cosine.min()) > np.cos(np.radians(2.0)), "of the sphere, not of its facets"
+    assert cosine.min() > np.cos(np.radians(2.0)), "of the sphere, not of its facets"
 
 
 def test_the_simplified_mesh_is_drawn_where_the_mesh_is():
@@ -107,9 +107,9 @@ def test_the_simplified_mesh_is_drawn_where_the_mesh_is():
     assert len(renderer._faces) <= 2500 < len(mesh.faces)
     simple = renderer.render(T, K[None], (128, 128))
     exact = render_depth(mesh, T, K, (128, 128))
-    assert float(((simple > 0) != (exact > 0)).sum()) < 0.01 * float((exact > 0).sum())
+    assert ((simple > 0) != (exact > 0)).sum() < 0.01 * float((exact > 0).sum())
     both = (simple > 0) & (exact > 0)
-    assert float((simple - exact)[both].abs().quantile(0.95)) < 0.01
+    assert (simple - exact)[both].abs().quantile(0.95) < 0.01
 
 
 def test_a_pose_that_is_no_number_has_no_points_and_leaves_the_others_theirs():
@@ -118,7 +118,7 @@ def test_a_pose_that_is_no_number_has_no_points_and_leaves_the_others_theirs():
     alone = contours.points(T[1:], K[None], 128)
     T[0] = torch.nan
     together = contours.points(T, K[None], 128)
-    assert not bool(together.valid[0].any())
+    assert not together.valid[0].any()
     assert torch.equal(together.valid[1:], alone.valid)
     assert torch.equal(together.model[1:][alone.valid], alone.model[alone.valid])
 
@@ -133,4 +133,4 @@ def test_places_lie_evenly_along_the_edges_of_each_pose():
     expected = torch.tensor([[1 / 2, 1 / 6, 1 / 2, 5 / 6], [1 / 4, 3 / 4, 1 / 4, 3 / 4]])
     torch.testing.assert_close(fraction[[0, 2]], expected)
     assert valid.all(dim=1).tolist() == [True, False, True]
-    assert not bool(valid[1].any())
+    assert not valid[1].any()

@@ -13,12 +13,13 @@ import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
 from curvireg_torch.rendering import contours as contours_module
 from curvireg_torch.rendering import make_renderer
+from tests._support.numbers import double
 
 from .conftest import camera
 
 
 def render(mesh, backend):
-    return cr.render_depth(mesh, *camera(4), renderer=backend)  # type: ignore[arg-type]
+    return cr.render_depth(mesh, *camera(4), renderer=backend)
 
 
 def assert_same_depth(found, expected, *, atol=1e-5):
@@ -57,7 +58,7 @@ def test_render_with_the_camera_inside_and_the_object_behind(backend, orthograph
     T[:, 2, 3] = torch.tensor([0.25, -5.0, 1.0 + near])  # inside; behind; just in front
     depth = renderer.render(T, wide, (30, 40), orthographic=orthographic)
     assert depth[0, 0, 15, 20] == pytest.approx(1.25, abs=1e-4)
-    assert bool((depth[1] == 0).all())
+    assert (depth[1] == 0).all()
     assert depth[2, 0, 15, 20] == pytest.approx(near, abs=1e-4)
 
 
@@ -67,7 +68,7 @@ def test_render_batches(backend):
     T, one, size = camera(2)
     outside = T.clone()
     outside[:, 0, 3] += 100.0
-    assert bool((renderer.render(outside, one, size) == 0).all())
+    assert (renderer.render(outside, one, size) == 0).all()
     assert renderer.render(T[:0], one, size).shape == (0, 1, *size)
     both = torch.stack([one, one])
     both[1, :2] *= 0.5
@@ -83,7 +84,7 @@ def test_render_is_precise_for_tiny_and_distant_objects(backend, scale, shift):
     T, one, size = camera(4)
     moved = mesh.copy().apply_scale(scale).apply_translation(shift)
     pose = T.clone()
-    pose[:, :3, 3] = T[:, :3, 3] * scale - T[:, :3, :3] @ torch.tensor(shift, dtype=torch.float64)
+    pose[:, :3, 3] = T[:, :3, 3] * scale - T[:, :3, :3] @ double(shift)
     depth = make_renderer(moved, backend).render(pose, one, size)
     torch.testing.assert_close(depth / scale, render(mesh, backend), rtol=0, atol=2e-5)
 
@@ -127,9 +128,7 @@ def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(
     T = torch.eye(4, dtype=torch.float64)[None]
     T[0, 2, 3] = 4.0
     for size in (100, 128, 129, 256, 400):
-        K = torch.tensor(
-            [[[size, 0, (size - 1) / 2], [0, size, (size - 1) / 2], [0, 0, 1]]], dtype=torch.float64
-        )
+        K = double([[[size, 0, (size - 1) / 2], [0, size, (size - 1) / 2], [0, 0, 1]]])
         points = contours.points(T, K, size)
         assert (points.model.norm(dim=-1)[points.valid] - 1.0).abs().max() < 0.005
     assert used == [2500, 2500, 8000, 8000, 8000]

@@ -66,8 +66,8 @@ def test_backends_agree(pair, name, orthographic):
     assert int(((a > 0) != (b > 0))[inside].sum()) == 0
     even = inside & (a > 0) & smooth(a, bend=0.01 * radius)
     assert even.sum() > 5000
-    assert float((a - b)[even].abs().max()) <= 1e-5 * radius
-    assert int(((a > 0) != (b > 0)).sum()) <= 10  # rounding at contours, in six views
+    assert (a - b)[even].abs().max() <= 1e-5 * radius
+    assert ((a > 0) != (b > 0)).sum() <= 10  # rounding at contours, in six views
 
 
 @pytest.mark.parametrize("name", MESHES)
@@ -93,8 +93,8 @@ def test_depth_of_a_sphere(backend, orthographic):
         inside = 16.0 - 15.0 * a
         expected = (4.0 - inside.clamp(min=0).sqrt()) / a
     facing = inside > 0.05
-    assert float((depth - expected).abs()[:, facing].max()) < 5e-4
-    assert not bool((depth > 0)[:, inside < 0].any())
+    assert (depth - expected).abs()[:, facing].max() < 5e-4
+    assert not (depth > 0)[:, inside < 0].any()
 
 
 def test_silhouette_agrees_with_project_points(backend, orthographic):
@@ -116,6 +116,6 @@ def test_silhouette_agrees_with_project_points(backend, orthographic):
     edges = torch.stack(distances)
     inside = edges.amin(0).maximum(-edges.amax(0))
     outside = -edges.amin(0).maximum(-edges.amax(0))
-    assert bool(mask[inside > 0.005].all())
-    assert not bool(mask[outside > 0.005].any())
-    assert int(mask.sum()) > 1000
+    assert mask[inside > 0.005].all()
+    assert not mask[outside > 0.005].any()
+    assert mask.sum() > 1000

@@ -4,16 +4,17 @@ import pytest
 import torch
 
 from curvireg_torch.rendering.shading import AMBIENT, LIT, shade
+from tests._support.numbers import double
 
 from .conftest import pixel_grid
 
-K = torch.tensor([[80.0, 0, 20.0], [0, 90.0, 40.0], [0, 0, 1]], dtype=torch.float64)
+K = double([[80.0, 0, 20.0], [0, 90.0, 40.0], [0, 0, 1]])
 RAYS = (pixel_grid((64, 64)) @ torch.linalg.inv(K).T).permute(2, 0, 1)
 
 
 @pytest.mark.parametrize("normal", [[0.3, -0.2, 1.0], [-0.4, 0.5, 1.0], [0.0, 0.0, 1.0]])
 def test_shade_is_exact_for_planes(normal):
-    n = torch.tensor(normal, dtype=torch.float64)
+    n = double(normal)
     along = torch.einsum("i,ihw->hw", n, RAYS)
     cosine = along / n.norm() / RAYS.norm(dim=0)
     grey = shade((5.0 / along)[None, None], K)[0, 0]

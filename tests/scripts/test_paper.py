@@ -1,6 +1,7 @@
 """The paper's measurements on rendered photographs, for which the true view must win."""
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -8,21 +9,20 @@ from dataclasses import replace
 from importlib import util
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation import evaluate
 from curvireg_torch.geometry import (
     camera_matrix,
     rotation_from_viewpoint,
 )
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from scripts._shared import commit
+from scripts._shared import commit, read_json
 from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
@@ -356,45 +356,37 @@ def climb(monkeypatch, out, *words):
     return staircase.main()
 
 
-@pytest.mark.slow
-def test_steps_have_the_results_of_an_evaluation(pascal, tmp_path, monkeypatch, capsys):
-    steps = [0, 8]
-    words = [f"mini={pascal.root}", "--quiet", "--steps", *steps]
-    assert climb(monkeypatch, tmp_path / "stairs", *words) == 0
-    benchmark = staircase.benchmark_of(pascal.root, 1)
-    pipelines = list(staircase.pipelines("upright"))
-    assert "mini: 2 objects left out" in capsys.readouterr().err
-    rows = staircase.read(tmp_path / "stairs" / "staircase.csv")
-    assert [row["step"] for row in rows] == ["0", "8"]
-    for k, row in zip(steps, rows, strict=True):
-        found = evaluate(benchmark, tmp_path / str(k), pipeline=pipelines[k][1], progress=False)
-        assert float(row["median"]) == pytest.approx(found["med_err_deg"], abs=1e-4)
-        assert float(row["right"]) == pytest.approx(found["acc_pi_6"])
-        assert int(row["n"]) == found["n"]
-
-
-def test_the_staircase_goes_on_where_it_was(pascal, tmp_path, monkeypatch):
+def test_steps_are_evaluated_and_recorded_once(pascal, tmp_path, monkeypatch, capsys):
     words = [f"mini={pascal.root}", "--quiet", "--steps", "0"]
-    assert climb(monkeypatch, tmp_path, *words, "--partial") == 0
-    assert staircase.read(tmp_path / "staircase.csv") == []
     assert climb(monkeypatch, tmp_path, *words) == 0
+    assert "unreadable_image" in capsys.readouterr().err
     (row,) = staircase.read(tmp_path / "staircase.csv")
-    monkeypatch.setattr(staircase, "measure", Mock(side_effect=AssertionError("measured again")))
-    assert climb(monkeypatch, tmp_path, *words) == 0
+    assert (row["set"], row["step"], row["n"], row["cads"]) == ("mini", "0", "3", "1")
+    summary = read_json(tmp_path / "mini" / "0" / "summary.json")
+    assert summary["settings"]["preset"] == "paper"
+    aware = summary["symmetry_aware"]
+    assert float(row["right"]) == aware["acc_pi_6"]
+    assert float(row["median"]) == pytest.approx(aware["med_err_deg"])
+    fail = Mock(side_effect=AssertionError("registered again"))
+    with monkeypatch.context() as patch:
+        patch.setattr("curvireg_torch.evaluation.datasets.cached_bank", fail)
+        assert climb(monkeypatch, tmp_path, *words) == 0
     assert staircase.read(tmp_path / "staircase.csv") == [row]
-    with pytest.raises(AssertionError, match="measured again"):
-        climb(monkeypatch, tmp_path, *words[:-1], "1")
     assert climb(monkeypatch, tmp_path, "nothing") == 2
 
 
-def test_objects_without_a_pose_count_as_wrong(pascal, monkeypatch):
-    benchmark = staircase.benchmark_of(pascal.root, 1)
-    (chosen,) = staircase.chosen_objects(benchmark, 1)
-    climber = staircase.Climber(benchmark, chosen)
-    monkeypatch.setattr(
-        staircase, "register_observation", Mock(side_effect=InvalidInputError("no"))
+def test_objects_without_a_pose_count_as_wrong(pascal, tmp_path, monkeypatch):
+    found = SimpleNamespace(
+        errors={
+            "a": {"symmetric_error_deg": math.inf, "error_deg": 5.0},
+            "b": {"symmetric_error_deg": 29.0, "error_deg": 90.0},
+            "c": {"symmetric_error_deg": math.nan, "error_deg": 5.0},
+        }
     )
-    assert climber.errors(PRESETS["paper"]) == [180.0]
-    errors = {"error_deg": torch.tensor([90.0]), "symmetric_error_deg": torch.tensor([5.0])}
-    monkeypatch.setattr(benchmark, "errors", lambda *_: errors)
-    assert climber.errors(PRESETS["paper"]) == [5.0], "up to symmetries"
+    keys = [entry.key for entry in staircase.benchmark_of(pascal.root, 1).entries]
+    found.errors = dict(zip(keys, found.errors.values(), strict=False))
+    monkeypatch.setattr(staircase, "evaluate", lambda *_, **__: {"skipped": {}})
+    monkeypatch.setattr(staircase, "read_run", lambda _: found)
+    assert climb(monkeypatch, tmp_path, f"mini={pascal.root}", "--steps", "3") == 0
+    (row,) = staircase.read(tmp_path / "staircase.csv")
+    assert (row["n"], row["right"], row["median"]) == ("2", "0.5", "104.5")

@@ -541,7 +541,7 @@ def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
     document = json.loads(browser.downloaded("result.json"))
     assert document["frame"] == "world"
     assert [view["photo"] for view in document["photographs"]] == ["table-4.png", "table-5.png"]
-    assert float(rotation_error(torch.tensor(document["rotation"]), torch.eye(3))) < 3
+    assert rotation_error(torch.tensor(document["rotation"]), torch.eye(3)) < 3
     browser.picture("viewer-rig")
     browser.click("no-rig")
     browser.wait(

@@ -74,7 +74,7 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
     assert main([*words, "--out", str(tmp_path / "result")]) == 0
     written = json.loads((tmp_path / "result" / "result.json").read_text())
     document = json.loads(to_json(session.document()))
-    assert float(rotation_error(torch.tensor(document["rotation"]).double(), WORLD[:3, :3])) < 1.5
+    assert rotation_error(torch.tensor(document["rotation"]).double(), WORLD[:3, :3]) < 1.5
     assert [*document] == [*written, "viewer"]
     for row in written["photographs"]:
         row["photo"] = Path(row["photo"]).name

@@ -26,6 +26,7 @@ from curvireg_torch.viewer import session as module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.shot import dragged_box
 from tests._support.exif import exif, with_exif
+from tests._support.numbers import double
 from tests._support.scenes import scene, write_photo
 
 VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
@@ -89,7 +90,7 @@ def test_command_gives_the_same_result_bit_by_bit(session, registered):
         assert document[key] == written[key], key
     assert document["inputs"]["box"] == written["inputs"]["box"]
     assert document["viewer"] == {"command": session.command(), "hypothesis": 0, "by_hand": []}
-    assert float(rotation_error(torch.tensor(document["rotation"]).double(), truth[:3, :3])) < 10
+    assert rotation_error(torch.tensor(document["rotation"]).double(), truth[:3, :3]) < 10
 
 
 @pytest.mark.slow
@@ -156,11 +157,9 @@ def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
     )
     session.shot.place(moved)
     pose = session.shot.answer.pose
-    assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(6, abs=1e-4)
+    assert rotation_error(pose.rotation, before.rotation) == pytest.approx(6, abs=1e-4)
     shift = pose.rotation @ describer.centre + pose.translation - centre
-    torch.testing.assert_close(
-        shift, torch.tensor([0.05 * describer.radius, 0, 0], dtype=torch.float64)
-    )
+    torch.testing.assert_close(shift, double([0.05 * describer.radius, 0, 0]))
     document = json.loads(to_json(session.document()))
     assert document["rotation"] == pose.rotation.tolist() == document["hypotheses"][0]["rotation"]
     assert len(document["hypotheses"]) == 2
@@ -182,10 +181,8 @@ def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
     session.shot.fit()
     fitted = session.shot.answer
     assert fitted.edits[1].startswith("contours fitted, edge support ")
-    assert float(rotation_error(fitted.pose.rotation, before.rotation)) < 1.5
-    assert float((fitted.pose.translation - before.translation).norm()) < 0.03 * float(
-        centre.norm()
-    )
+    assert rotation_error(fitted.pose.rotation, before.rotation) < 1.5
+    assert (fitted.pose.translation - before.translation).norm() < 0.03 * float(centre.norm())
     for answer in (pose, fitted.pose):  # one step back, and again
         session.shot.undo()
         assert session.shot.answer.pose is answer
@@ -204,11 +201,8 @@ def test_the_python_program_gives_the_same_numbers(session, registered):
         program = session.python()
         exec(program, names)
     assert "None" not in program, "no defaults"
-    found = {
-        name: torch.tensor(names["pose"][name], dtype=torch.float64)
-        for name in ("rotation", "translation")
-    }
-    assert float(rotation_error(found["rotation"], session.shot.answer.pose.rotation)) < 0.1
+    found = {name: double(names["pose"][name]) for name in ("rotation", "translation")}
+    assert rotation_error(found["rotation"], session.shot.answer.pose.rotation) < 0.1
     assert torch.allclose(found["translation"], session.shot.answer.pose.translation, rtol=1e-3)
     session.shot.place(
         session.shot.result.moved(session.shot.answer.pose.projection[0], rotation=(0, 6, 0))
@@ -233,11 +227,11 @@ def test_move_without_a_camera_keeps_the_allocentric_rotation(session, monkeypat
     session.shot.place(session.shot.result.moved(T, rotation=(0, 0, 5)))
     pose = session.shot.answer.pose
     assert pose.translation is None
-    assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(5, abs=1e-3)
+    assert rotation_error(pose.rotation, before.rotation) == pytest.approx(5, abs=1e-3)
     # A translation keeps the rotation of the projection and changes the allocentric one.
     session.shot.place(session.shot.result.moved(pose.projection[0], translation=(0.1, 0, 0)))
     assert torch.equal(session.shot.answer.pose.projection[0][:3, :3], pose.projection[0][:3, :3])
-    assert 0.1 < float(rotation_error(session.shot.answer.pose.rotation, pose.rotation)) < 5
+    assert 0.1 < rotation_error(session.shot.answer.pose.rotation, pose.rotation) < 5
     assert session.document()["translation"] is None
 
 
@@ -450,12 +444,9 @@ def test_the_mesh_follows_the_mouse_its_wheel_and_two_fingers(pose):
     result, T, K, describer = pose
     moved = result.dragged(T, K, (100.0, 80.0), (112.0, 75.0), turns=False)
     shift = seen(moved, K, describer.centre) - seen(T, K, describer.centre)
-    torch.testing.assert_close(shift, torch.tensor([12.0, -5.0], dtype=torch.float64))
+    torch.testing.assert_close(shift, double([12.0, -5.0]))
     assert torch.equal(moved[:3, :3], T[:3, :3])
-    near = (
-        T[:3, :3].T @ torch.tensor([0, 0, -describer.radius], dtype=torch.float64)
-        + describer.centre
-    )
+    near = T[:3, :3].T @ double([0, 0, -describer.radius]) + describer.centre
     turned = result.dragged(T, K, (0.0, 0.0), (4.0, 3.0), turns=True)
     shift = seen(turned, K, near) - seen(T, K, near)
     assert 4 < shift[0] < 8, "right and down, a little more than the mouse, as it is nearer"
@@ -464,11 +455,9 @@ def test_the_mesh_follows_the_mouse_its_wheel_and_two_fingers(pose):
     moved = result.scaled(T, 1.25, roll=30.0)
     centres = [P[:3, :3] @ describer.centre + P[:3, 3] for P in (T, moved)]
     torch.testing.assert_close(centres[1], centres[0] / 1.25)
-    assert float(rotation_error(moved[:3, :3], T[:3, :3])) == pytest.approx(30, abs=1e-4)
+    assert rotation_error(moved[:3, :3], T[:3, :3]) == pytest.approx(30, abs=1e-4)
     # Clockwise on the screen: what is right of the centre goes down.
-    right = (
-        T[:3, :3].T @ torch.tensor([describer.radius, 0, 0], dtype=torch.float64) + describer.centre
-    )
+    right = T[:3, :3].T @ double([describer.radius, 0, 0]) + describer.centre
     assert seen(moved, K, right)[1] > seen(T, K, right)[1]
     with pytest.raises(InvalidInputError, match="touch the camera"):
         result.scaled(T, 1000.0)
@@ -478,10 +467,8 @@ def test_the_mesh_follows_the_mouse_its_wheel_and_two_fingers(pose):
 @pytest.mark.parametrize("elevation", [-30.0, 0.0, 60.0])
 def test_a_hint_is_the_side_from_which_the_model_is_seen(azimuth, elevation):
     """The camera of that viewpoint stands where the hint was taken, in the frame of limits."""
-    R = rotation_from_viewpoint(
-        *(torch.tensor(angle, dtype=torch.float64) for angle in (azimuth, elevation, 0.0))
-    )
-    position = R.mT @ torch.tensor([0.0, 0.0, -3.0], dtype=torch.float64)
+    R = rotation_from_viewpoint(*(double(angle) for angle in (azimuth, elevation, 0.0)))
+    position = R.mT @ double([0.0, 0.0, -3.0])
     session = Session(RegisterOptions(limits={"front": "x"}))
     session.hint_direction(position.tolist())
     assert session.options.limits["viewpoint"] == pytest.approx((azimuth, elevation, 0.0), abs=0.06)

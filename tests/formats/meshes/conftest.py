@@ -1,3 +1,31 @@
 """What tests of meshes share."""
 
+import pytest
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError
 from tests._support.meshes import load as load
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a file, of a text or of bytes, and return its path."""
+
+    def written(name, content):
+        path = tmp_path / name
+        path.write_bytes(content) if isinstance(content, bytes) else path.write_text(content)
+        return path
+
+    return written
+
+
+@pytest.fixture
+def refused(write):
+    """Write a file, and check that it is refused as a mesh with a message that matches."""
+
+    def check(name, content, match, **options):
+        path = write(name, content)
+        with pytest.raises(MeshError, match=match):
+            cr.load_mesh(path, **options)
+
+    return check

@@ -159,11 +159,10 @@ OUTSIDE = [
 
 
 @pytest.mark.parametrize("uri", [*OUTSIDE, "link.bin", "Linked/b.bin", "linked/b.bin", "no.bin"])
-def test_load_mesh_opens_no_file_outside_the_folder(tmp_path, uri):
+def test_load_mesh_opens_no_file_outside_the_folder(tmp_path, write, uri):
     folder = tmp_path / "inside"
     folder.mkdir()
-    (tmp_path / "b.bin").write_bytes(POINTS)
-    (folder / "link.bin").symlink_to(tmp_path / "b.bin")
+    (folder / "link.bin").symlink_to(write("b.bin", POINTS))
     # names that differ in upper and lower case only are searched for: in links to folders too
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "b.bin").write_bytes(POINTS)

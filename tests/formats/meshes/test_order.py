@@ -224,11 +224,10 @@ def test_the_texture_of_a_polygon_is_that_of_its_triangles(pictures):
     assert textures(mesh) == [GREEN, GREEN, RED, WHITE, WHITE]
 
 
-def test_colours_of_faces_win_over_those_of_vertices(tmp_path):
+def test_colours_of_faces_win_over_those_of_vertices(write):
     names = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
     text = header(names, names) + rows(["255 0 0"] * 4) + "3 0 1 2 0 0 255\n3 0 2 3 0 255 0\n"
-    (tmp_path / "a.ply").write_text(text)
-    assert first_corners(cr.load_mesh(tmp_path / "a.ply")) == [BLUE, GREEN]
+    assert first_corners(cr.load_mesh(write("a.ply", text))) == [BLUE, GREEN]
 
 
 # 3MF
@@ -334,26 +333,24 @@ def test_helpers_and_holes_are_no_surface(tmp_path, load):
 
 
 @needs_usd
-def test_a_part_of_usd_lies_in_the_frame_of_its_parent(tmp_path, load):
+def test_a_part_of_usd_lies_in_the_frame_of_its_parent(write, load):
     inner = square(
         "double3 xformOp:translate = (5, 0, 0)\n"
         '        uniform token[] xformOpOrder = ["xformOp:translate"]'
     )
     place = "    double3 xformOp:rotateXYZ = (0, 0, 90)\n"
     place += '    uniform token[] xformOpOrder = ["xformOp:rotateXYZ"]\n'
-    (tmp_path / "a.usda").write_text(stage(inner, place=place))
-    mesh, _ = load(tmp_path / "a.usda")
+    mesh, _ = load(write("a.usda", stage(inner, place=place)))
     np.testing.assert_allclose(mesh.bounds, [[-1, 5, 0], [0, 7, 0]], atol=1e-6)
 
 
 @needs_usd
-def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path, load):
+def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path, write, load):
     (tmp_path / "textures").mkdir()
     (tmp_path / "textures" / "print.png").write_bytes(painted((255, 0, 0)))
     colour = 'color3f[] primvars:displayColor = [(0, 1, 0)] (interpolation = "constant")\n        '
     plain = square(colour).replace('"square"', '"plain"')
-    (tmp_path / "a.usda").write_text(stage(MATERIAL, square(colour + MAP, BOUND), plain))
-    mesh, _ = load(tmp_path / "a.usda")
+    mesh, _ = load(write("a.usda", stage(MATERIAL, square(colour + MAP, BOUND), plain)))
     assert first_corners(mesh) == [WHITE, WHITE, GREEN, GREEN]
     assert textures(mesh) == [RED, RED, WHITE, WHITE]
 
@@ -423,7 +420,7 @@ def test_colours_are_fractions_or_bytes(values, expected):
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply"])
-def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(tmp_path, suffix):
+def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(write, suffix):
     shades = ["1.0024 0.2 0", "0 0.2 0", "1 0.2 0"]
     if suffix == "obj":
         points = [
@@ -433,8 +430,7 @@ def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(tmp_pa
     else:
         names = "".join(f"property float {name}\n" for name in ("red", "green", "blue"))
         text = header(names, "") + rows([*shades, "1 1 1"]) + "3 0 1 2\n3 3 0 1\n"
-    (tmp_path / f"a.{suffix}").write_text(text)
-    mesh = cr.load_mesh(tmp_path / f"a.{suffix}")
+    mesh = cr.load_mesh(write(f"a.{suffix}", text))
     assert has_colours(mesh)
     assert first_corners(mesh) == [[255, 51, 0], WHITE]
 
@@ -457,11 +453,10 @@ def test_no_unit_is_proposed_for_a_mesh_that_none_makes_plausible(tmp_path):
         cr.load_mesh(tmp_path / "b.stl")
 
 
-def test_names_do_not_lead_out_of_a_folder_of_textures(tmp_path):
+def test_names_do_not_lead_out_of_a_folder_of_textures(tmp_path, write):
     for folder in ("mesh", "textures"):
         (tmp_path / folder).mkdir()
-    (tmp_path / "secret.png").write_bytes(b"secret")
-    (tmp_path / "textures" / "link.png").symlink_to(tmp_path / "secret.png")
+    (tmp_path / "textures" / "link.png").symlink_to(write("secret.png", b"secret"))
     source = MeshSource(tmp_path / "mesh" / "a.obj", [tmp_path / "textures"])
     for name in ("../secret.png", "link.png", "../mesh/../secret.png"):
         assert not source.has(name)

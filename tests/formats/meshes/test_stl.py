@@ -39,31 +39,25 @@ def check(mesh):
     [b"exported", b"solid Part1", b"solid facet vertex", "solid Gehäuse".encode("latin-1")],
 )
 @pytest.mark.parametrize("tail", [b"", b"\r\n"])
-def test_the_header_of_a_binary_file_says_nothing(tmp_path, load, header, tail):
-    (tmp_path / "a.stl").write_bytes(binary(header, tail=tail))
-    mesh, texts = load(tmp_path / "a.stl")
+def test_the_header_of_a_binary_file_says_nothing(write, load, header, tail):
+    mesh, texts = load(write("a.stl", binary(header, tail=tail)))
     check(mesh)
     assert not texts
 
 
-def test_faces_behind_the_last_one_are_named(tmp_path, load):
-    (tmp_path / "a.stl").write_bytes(binary(claimed=5))
-    mesh, texts = load(tmp_path / "a.stl")
+def test_faces_behind_the_last_one_are_named(write, load):
+    mesh, texts = load(write("a.stl", binary(claimed=5)))
     assert len(mesh.faces) == 5
     assert "it says 5 faces and holds 12: the others are left out" in texts[0]
 
 
-def test_text_that_is_no_stl_is_not_taken_for_a_binary_file(tmp_path):
-    (tmp_path / "a.stl").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n" * 9)
-    with pytest.raises(MeshError, match="is no STL file"):
-        cr.load_mesh(tmp_path / "a.stl")
+def test_text_that_is_no_stl_is_not_taken_for_a_binary_file(refused):
+    refused("a.stl", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n" * 9, "is no STL file")
 
 
 @pytest.mark.parametrize("cut", [1, 49, 50, 120, 599])
-def test_a_binary_file_that_is_cut_is_refused(tmp_path, cut):
-    (tmp_path / "a.stl").write_bytes(binary()[:-cut])
-    with pytest.raises(MeshError, match=r"says 12 faces and holds .*cut while it was written"):
-        cr.load_mesh(tmp_path / "a.stl")
+def test_a_binary_file_that_is_cut_is_refused(refused, cut):
+    refused("a.stl", binary()[:-cut], r"says 12 faces and holds .*cut while it was written")
 
 
 @pytest.mark.parametrize(
@@ -95,9 +89,8 @@ def test_a_binary_file_that_is_cut_is_refused(tmp_path, cut):
         "blank",
     ],
 )
-def test_ascii_files_of_every_encoding(tmp_path, load, content):
-    (tmp_path / "a.stl").write_bytes(content)
-    mesh, texts = load(tmp_path / "a.stl")
+def test_ascii_files_of_every_encoding(write, load, content):
+    mesh, texts = load(write("a.stl", content))
     check(mesh)
     assert not texts
 
@@ -132,10 +125,8 @@ def test_an_ascii_file_that_is_cut_short_says_so(tmp_path, load):
         (b"nothing of the kind", "too early"),
     ],
 )
-def test_damaged_files_are_refused(tmp_path, content, match):
-    (tmp_path / "a.stl").write_bytes(content)
-    with pytest.raises(MeshError, match=match):
-        cr.load_mesh(tmp_path / "a.stl")
+def test_damaged_files_are_refused(refused, content, match):
+    refused("a.stl", content, match)
 
 
 HOSTILE = {

@@ -147,6 +147,12 @@ def test_large_textures_are_reduced_in_every_mode(mode):
     assert int(pixels.min()) >= 254 or mode == "CMYK"
 
 
-def test_a_mesh_without_any_colour_has_none(tmp_path):
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n")
-    assert surface_colours(cr.load_mesh(tmp_path / "a.obj")) is None
+def test_a_mesh_without_any_colour_has_none(write):
+    assert (
+        surface_colours(
+            cr.load_mesh(
+                write("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n")
+            )
+        )
+        is None
+    )

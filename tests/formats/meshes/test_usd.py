@@ -193,7 +193,7 @@ def test_textures_lie_beside_the_file_that_names_them(tmp_path, load):
         assert (textures_of(mesh), texts) == ([[0, 255, 0]], [])
 
 
-def test_a_texture_whose_file_is_an_input_of_the_material(tmp_path, load):
+def test_a_texture_whose_file_is_an_input_of_the_material(tmp_path, write, load):
     (tmp_path / "print.png").write_bytes(painted((1, 2, 3)))
     named = MATERIAL.replace(
         "asset inputs:file = @textures/print.png@",
@@ -201,8 +201,7 @@ def test_a_texture_whose_file_is_an_input_of_the_material(tmp_path, load):
     )
     surface = "        token outputs:surface.connect"
     named = named.replace(surface, f"        asset inputs:picture = @print.png@\n{surface}", 1)
-    (tmp_path / "part.usda").write_text(stage(named, square(MAP, BOUND)))
-    assert textures_of(load(tmp_path / "part.usda")[0]) == [[1, 2, 3]]
+    assert textures_of(load(write("part.usda", stage(named, square(MAP, BOUND))))[0]) == [[1, 2, 3]]
 
 
 def test_textures_are_scaled(tmp_path, load):
@@ -254,16 +253,13 @@ def test_references_stay_in_the_folder(tmp_path, load):
         ),
     ],
 )
-def test_what_is_not_read_is_refused(tmp_path, load, text, match):
-    (tmp_path / "part.usda").write_text(text)
-    with pytest.raises(MeshError, match=match):
-        load(tmp_path / "part.usda")
+def test_what_is_not_read_is_refused(refused, text, match):
+    refused("part.usda", text, match)
 
 
-def test_other_parts_are_named(tmp_path, load):
+def test_other_parts_are_named(write, load):
     hidden = square('token visibility = "invisible"').replace('"square"', '"hidden"')
-    (tmp_path / "part.usda").write_text(stage(square(), '    def Cube "a" {}', hidden))
-    mesh, texts = load(tmp_path / "part.usda")
+    mesh, texts = load(write("part.usda", stage(square(), '    def Cube "a" {}', hidden)))
     assert len(mesh.faces) == 2
     assert any("no meshes are left out (Cube)" in text for text in texts)
 
@@ -283,8 +279,7 @@ def test_bounds(tmp_path, monkeypatch):
         monkeypatch.undo()
 
 
-def test_the_message_names_the_extra(tmp_path, monkeypatch):
+def test_the_message_names_the_extra(write, monkeypatch):
     monkeypatch.setattr(extras, "find_spec", lambda _: None)
-    (tmp_path / "part.usdz").write_text("a part")
     with pytest.raises(MissingDependencyError, match=r"pip install 'curvireg_torch\[usd\]'"):
-        cr.load_mesh(tmp_path / "part.usdz")
+        cr.load_mesh(write("part.usdz", "a part"))
