@@ -4,21 +4,17 @@
     [--limit N] [--jobs N] [--page PAGE]
 
 Each set is NAME=ROOT: ROOT is a PASCAL3D+ release if it has a folder ``CAD``, else a BOP set. Steps
-are cumulative, each has the results of ``curvireg evaluate``, and a second call does only what is
-missing: DIR/NAME holds one file for each mesh, DIR/staircase.csv one row for each set and step. All
-steps of a mesh are measured together, so that it is opened once. --page writes the table into a
-page of the documentation, between its markers.
+are cumulative. DIR/NAME/STEP holds what ``curvireg evaluate`` writes, which registers only what is
+missing, DIR/staircase.csv one row for each set and step. --page writes the table into a page of the
+documentation, between its markers.
 """
 
 import argparse
 import csv
-import json
+import math
 import statistics
 import sys
-import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,23 +25,20 @@ sys.path.insert(0, str(REPOSITORY))
 
 from curvireg_torch.data import BOPDataset, Pascal3DPlus
 from curvireg_torch.errors import CurviregError, InvalidInputError
-from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol
-from curvireg_torch.evaluation.benchmark import true_rotations
-from curvireg_torch.jobs.documents import line_document
-from curvireg_torch.jobs.entry import Observation, observe
-from curvireg_torch.jobs.photograph import register_observation
-from curvireg_torch.jobs.runner import results_digest
-from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
-from curvireg_torch.mesh import load_mesh
+from curvireg_torch.evaluation import (
+    Benchmark,
+    BOPBenchmark,
+    Pascal3DBenchmark,
+    Protocol,
+    evaluate,
+)
+from curvireg_torch.evaluation.compare import read_run
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
-from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Appearance, BoxShape
-from curvireg_torch.utils.files import file_digest, text_digest, write_csv
-from curvireg_torch.utils.threads import map_on_threads
+from curvireg_torch.utils.executors import Workers
+from curvireg_torch.utils.files import write_csv
 from scripts._shared import commit, table_lines, update_page
 from scripts.paper.measures import bootstrap
-from scripts.paper.parts import Part, complete
-from scripts.paper.parts import read as read_part
 
 RIGHT_DEG = 30.0
 FEWEST_CADS = 3  # for an interval
@@ -109,150 +102,42 @@ def benchmark_of(root: Path, pixel_origin: int) -> Benchmark:
     return BOPBenchmark(BOPDataset(root), Protocol(pose="any"))
 
 
-def chosen_objects(benchmark: Benchmark, limit: int | None) -> list[list[int]]:
-    """Indices of ``limit`` objects of known pose, spread evenly, those of one mesh together."""
-    known = true_rotations(benchmark.samples).isfinite().flatten(1).all(dim=1)
-    groups = defaultdict[Any, list[int]](list)
-    for i in benchmark.selection(limit):
-        if known[i] and not benchmark.entries[i].error:
-            groups[benchmark.entries[i].meshes].append(i)
-    return list(groups.values())
-
-
-class Climber:
-    """One mesh on the staircase, with those of its photographs that can be read.
-
-    What steps have in common is computed once: mesh, contours, and the views, which :data:`STEPS`
-    change five times only.
-    """
-
-    def __init__(
-        self, benchmark: Benchmark, chosen: list[int], every: Sequence[Pipeline] = ()
-    ) -> None:
-        """``every`` pipeline that is measured: views hold what any of them needs."""
-        self.benchmark = benchmark
-        self.every = every
-        self.mesh = load_mesh(benchmark.entries[chosen[0]].meshes[0], unit=benchmark.unit)
-        self.samples = []
-        self.photographs = []
-        for i in chosen:
-            entry = benchmark.entries[i]
-            with suppress(CurviregError, OSError):  # a photograph that cannot be read
-                self.photographs.append(observe(entry, entry.read()))
-                self.samples.append(benchmark.samples[i])
-        self.bank: ViewBank | None = None
-        self.describer: ViewDescriber | None = None
-
-    def errors(self, pipeline: Pipeline) -> list[float]:
-        """Rotation errors of a pipeline in degrees, up to symmetries where they are known; 180
-        where it finds no pose."""
-        registrar = self._registrar(pipeline)
-
-        def row(observation: Observation) -> dict[str, Any]:
-            try:
-                return line_document(register_observation(observation, registrar).document)
-            except CurviregError:
-                return {}
-
-        rows = map_on_threads(row, self.photographs)
-        errors = self.benchmark.errors(self.samples, rows)[self.benchmark.page_error]
-        return errors.clamp(max=180.0).tolist()
-
-    def _registrar(self, pipeline: Pipeline) -> Registrar:
-        bank = self._bank(pipeline)
-        matcher = map_on_threads(lambda bank: ViewMatcher(bank, pipeline=pipeline), [bank])[0]
-        if self.describer is None:
-            self.describer = matcher.describer
-            _ = self.describer.contours
-        matcher.describer = self.describer.with_settings(bank.settings)
-        # as in :func:`curvireg_torch.evaluation.evaluate`
-        mesh_is = "exact" if self.benchmark.gives_camera else "similar"
-        return Registrar(matcher, mesh_is=mesh_is)
-
-    def _bank(self, pipeline: Pipeline) -> ViewBank:
-        """The views of the step before, if a pipeline has the same."""
-        views = pipeline.views, pipeline.bank
-        if self.bank is None or (self.bank.pipeline.views, self.bank.pipeline.bank) != views:
-            same = [one for one in self.every if (one.views, one.bank) == views]
-            needy = [one for one in same if one.stored_appearance(1) is not None]
-            built = next(iter(needy), pipeline)
-            self.bank = ViewBank.build(self.mesh, pipeline=built, progress=False)
-            # as files of the cache have them
-            self.bank.descriptors = self.bank.descriptors.half().float()
-        return self.bank
-
-
-def measure(root: Path, pixel_origin: int, chosen: list[int], steps: list[int]) -> dict[str, Any]:
-    """Errors of some objects of one mesh after each of some steps."""
-    benchmark = benchmark_of(root, pixel_origin)
-    every = [pipeline for _, pipeline in pipelines(benchmark.protocol.pose)]
-    start = time.process_time()
-    errors: dict[str, list[float]] = {str(k): [] for k in steps}
-    seconds: dict[str, float] = {}
-    result = {"errors": errors, "seconds": seconds, "commit": commit()}
-    try:
-        climber = Climber(benchmark, chosen, every)
-    except (CurviregError, OSError):
-        return {**result, "cads": [], "unreadable": len(chosen)}
-    for k in steps:
-        errors[str(k)] = climber.errors(every[k])
-        seconds[str(k)] = time.process_time() - start
-        start = time.process_time()
-    cads = [str(sample[benchmark.mesh]) for sample in climber.samples]
-    return {**result, "cads": cads, "unreadable": len(chosen) - len(cads)}
-
-
 def climb(name: str, root: Path, options: argparse.Namespace) -> None:
-    """Measure the steps of one set, and record them when all of its meshes are done."""
+    """Evaluate the steps of one set, and record them."""
     benchmark = benchmark_of(root, options.pixel_origin)
-    groups = chosen_objects(benchmark, options.limit)
-    steps = dict(enumerate(pipelines(benchmark.protocol.pose)))
-    chosen = [k for k in options.steps or steps if k in steps]
-    settings = [steps[k][1].describe() for k in chosen]
-    code = [results_digest(), file_digest(Path(__file__))]
-    jobs = []
-    for group in groups:
-        entries = [benchmark.entries[i] for i in group]
-        files = [entries[0].meshes[0], *(entry.photo for entry in entries)]
-        requests = [repr(entry.request()) for entry in entries]
-        digests = [file_digest(path) for path in files]
-        request = json.dumps([code, settings, requests, digests])
-        path = options.out / name / f"{text_digest(request)}.json"
-        given = (root, options.pixel_origin, group, chosen)
-        jobs.append(Part(path, given, len(group)))
-    # In a fixed random order: the part that an interrupted run has measured is a fair one.
-    jobs.sort(key=lambda job: job.path.name)
-    if options.partial:
-        jobs = [job for job in jobs if job.path.exists()]
-    complete(jobs, measure, label=name, jobs=options.jobs, quiet=options.quiet)
-    names = {k: steps[k][0] for k in chosen}
-    record(name, names, [read_part(job) for job in jobs], options.out / "staircase.csv")
+    entries = zip(benchmark.entries, benchmark.samples, strict=True)
+    cads = {entry.key: str(sample[benchmark.mesh]) for entry, sample in entries}
+    for k, (step, pipeline) in enumerate(pipelines(benchmark.protocol.pose)):
+        if k not in (options.steps or [k]):
+            continue
+        folder = options.out / name / f"{k}"
+        how = {"limit": options.limit, "progress": not options.quiet}
+        summary = evaluate(
+            benchmark, folder, pipeline=pipeline, workers=Workers(options.jobs), **how
+        )
+        if summary["skipped"]:
+            print(f"staircase: {name}: left out: {dict(summary['skipped'])}", file=sys.stderr)
+        found = {key: each[benchmark.page_error] for key, each in read_run(folder).errors.items()}
+        known = {key: min(error, 180.0) for key, error in found.items() if not math.isnan(error)}
+        if known:
+            row = [name, k, step, *scores(known, cads), commit()]
+            record(row, options.out / "staircase.csv")
 
 
-def record(name: str, steps: dict[int, str], records: list[dict[str, Any]], path: Path) -> None:
-    """Write the rows of a set from the records of its meshes."""
-    cads = [cad for one in records for cad in one["cads"]]
-    commits = " ".join(sorted({one["commit"] for one in records}))
-    if unreadable := sum(one["unreadable"] for one in records):
-        message = "objects left out, whose photograph or mesh cannot be read"
-        print(f"staircase: {name}: {unreadable} {message}", file=sys.stderr)
-    rows = []
-    for k, step in steps.items() if cads else ():
-        errors = [error for one in records for error in one["errors"][str(k)]]
-        right = bootstrap([float(error < RIGHT_DEG) for error in errors], cads)
-        numbers = [
-            right.n,
-            len(set(cads)),
-            right.mean,
-            right.low,
-            right.high,
-            statistics.median(errors),
-        ]
-        rows.append([name, k, step, *numbers, commits])
-    measured = {(name, str(row[1])) for row in rows}
-    kept = [row for row in read(path) if (row["set"], row["step"]) not in measured]
-    every = sorted([*(list(row.values()) for row in kept), *rows], key=lambda r: (r[0], int(r[1])))
-    write_csv(path, [COLUMNS, *every])
+def scores(errors: dict[str, float], cads: dict[str, str]) -> list[float]:
+    """Numbers of objects and CADs, share within 30 degrees and its interval, and median error."""
+    groups = [cads[key] for key in errors]
+    right = bootstrap([float(error < RIGHT_DEG) for error in errors.values()], groups)
+    share = [right.mean, right.low, right.high]
+    return [right.n, len(set(groups)), *share, statistics.median(errors.values())]
+
+
+def record(row: list[Any], path: Path) -> None:
+    """Write a row in the place of that of the same set and step."""
+    kept = [list(each.values()) for each in read(path)]
+    kept = [each for each in kept if each[:2] != [row[0], str(row[1])]]
+    rows = sorted([*kept, row], key=lambda each: (each[0], int(each[1])))
+    write_csv(path, [COLUMNS, *rows])
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -300,9 +185,6 @@ def main() -> int:
     )
     parser.add_argument("--steps", type=int, nargs="+", help="numbers of steps (default: all)")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
-    parser.add_argument(
-        "--partial", action="store_true", help="rows of what is measured so far; measures nothing"
-    )
     parser.add_argument(
         "--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)"
     )
