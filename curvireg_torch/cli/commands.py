@@ -10,6 +10,7 @@ from typing import Any
 from ..errors import InvalidInputError, MissingFileError
 from ..evaluation.registry import DATASETS
 from ..jobs.options import whole_number
+from ..utils.aliases import Fields
 from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
 from ..version import __version__
@@ -81,7 +82,7 @@ def _build_bank(arguments: argparse.Namespace) -> None:
     check_output_file(arguments.out, input_files(arguments, arguments.mesh), mark=b"curvireg")
     pipeline = options.open_pipeline()
     mesh = options.load_mesh(arguments.mesh)
-    settings: dict[str, Any] = {
+    settings: Fields = {
         "renderer": options.renderer,
         "progress": options.progress,
         "device": options.device,
@@ -188,7 +189,7 @@ def _run_evaluation(arguments: argparse.Namespace) -> None:
     pipeline = options.open_pipeline()
     benchmark = kind.scored(kind.open(arguments.root, **kind.chosen(arguments)), protocol)
     check_writable(out)
-    how: dict[str, Any] = {
+    how: Fields = {
         "limit": arguments.limit,
         "renderer": options.renderer,
         "progress": options.progress,

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import CurviregError, ImageError, InvalidInputError, MissingFileError
 from ..jobs.options import CAMERA_OPTIONS
+from ..utils.aliases import Fields
 from ..utils.choices import check_given
 from ..utils.files import CsvFile
 from .libraries import load_libraries
@@ -62,8 +63,7 @@ def add_follow(commands: Any) -> None:
         run=run,
     )
     frames = (
-        "a video; a folder of frames in the order of their names; the number of a camera, "
-        "such as "
+        "a video; a folder of frames in the order of their names; the number of a camera, such as "
         "0; or a stream, "
     )
     parser.add_argument(
@@ -132,9 +132,8 @@ def run(arguments: argparse.Namespace) -> None:
     if not tally.posed:
         reason = f"; the first: {tally.first_message}" if tally.frames else ""
         message = (
-            f"no frame could be registered{reason}; give frames that can be read, and "
-            f"--box of "
-            f"the object"
+            f"no frame could be registered{reason}; give frames that can be read, and --box of the "
+            "object"
         )
         raise InvalidInputError(message, subject=source)
 
@@ -162,7 +161,7 @@ class Tally:
         """Number of frames."""
         return self.counts.total()
 
-    def add(self, pose: dict[str, Any], seconds: float) -> None:
+    def add(self, pose: Fields, seconds: float) -> None:
         """Count a frame that took ``seconds``."""
         if self.frames:
             self.seconds_after_first += seconds
@@ -380,8 +379,8 @@ def _live(source: str) -> tuple[Iterator["Frame"], None, float]:
     """Frames of a camera or a stream: a thread reads them, and the latest one is taken, so that
     none is late."""
     import cv2
-    import numpy as np
-    import torch
+
+    from ..data.images import frame_tensor
 
     file = cv2.VideoCapture(int(source) if source.isdecimal() else source)
     if not file.isOpened():
@@ -410,8 +409,7 @@ def _live(source: str) -> tuple[Iterator["Frame"], None, float]:
             while reader.is_alive() or not latest.empty():
                 with suppress(Empty):
                     number, pixels = latest.get(timeout=0.2)
-                    rgb = np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1))
-                    yield f"frame-{number:06d}", torch.from_numpy(rgb)
+                    yield f"frame-{number:06d}", frame_tensor(pixels)
         finally:
             ended.set()
             reader.join(timeout=5.0)
@@ -430,7 +428,7 @@ def _camera_in_words(result: "Registration | FailedRegistration") -> str:
     return focal_length_in_words(result.camera.describe())
 
 
-def _document(result: "Registration | FailedRegistration") -> dict[str, Any]:
+def _document(result: "Registration | FailedRegistration") -> Fields:
     """A pose, or why there is none, as JSON values."""
     from ..registration import FailedRegistration
 
@@ -441,7 +439,7 @@ def _document(result: "Registration | FailedRegistration") -> dict[str, Any]:
     return {"verdict": result.verdict, **pose, **scores}
 
 
-def _cells(pose: dict[str, Any]) -> list[Any]:
+def _cells(pose: Fields) -> list[Any]:
     """The row of a frame in ``results.csv``."""
     numbers = [""] * 12
     if "rotation" in pose:

@@ -18,11 +18,12 @@ from ..jobs.options import (
     prior_from_limits,
     whole_number,
 )
+from ..utils.aliases import Fields
 
 FIELDS = {
     option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata
 }
-DECLARED: dict[str, dict[str, Any]] = FIELDS | PRIOR_OPTIONS
+DECLARED: dict[str, Fields] = FIELDS | PRIOR_OPTIONS
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
 MESH = ("unit", "link", "textures", "pose", "up")
 BOXES = ("box_format", "boxes")
@@ -69,8 +70,7 @@ def add_options(parser: Any, *names: str, **help_texts: str) -> None:
 def add_limits(parser: Any) -> None:
     """Add the options that limit the pose."""
     text = (
-        "limits, angles in degrees; all that are given must hold; the result stays within "
-        "them. "
+        "limits, angles in degrees; all that are given must hold; the result stays within them. "
         "Lists have columns of"
     )
     add_options(
@@ -114,7 +114,7 @@ def register_options(
         raise InvalidInputError(f"--{error}") from error
     check_camera(given.get("camera"), given.get("guess"))
     check_device(given.get("device", "cpu"), "--device")
-    common: dict[str, Any] = {"photos": tuple(photos), "meshes": tuple(meshes), "limits": limits}
+    common: Fields = {"photos": tuple(photos), "meshes": tuple(meshes), "limits": limits}
     options = RegisterOptions(**common, unit_is_given="unit" in given, **given)
     options.open_files()
     return options

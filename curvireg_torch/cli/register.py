@@ -4,7 +4,7 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import chain
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..formats.exports.ros import OPTICAL_FRAME, time_stamp
 from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
+from ..utils.aliases import Document, Fields
 from ..utils.choices import VIDEOS, check_given, is_one_photograph
 from .libraries import load_libraries
 from .options import (
@@ -405,9 +406,7 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     return result.verdict in _enough(arguments)
 
 
-def _write_pose(
-    arguments: argparse.Namespace, document: dict[str, Any], registrar: "Registrar"
-) -> None:
+def _write_pose(arguments: argparse.Namespace, document: Fields, registrar: "Registrar") -> None:
     """Write the pose in the format of another tool, if one is asked for."""
     from ..formats.exports.ros import write_ros
 
@@ -427,7 +426,7 @@ def _write_pose(
             )
 
 
-def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
+def _finish(arguments: argparse.Namespace, document: Fields) -> None:
     """Print the result."""
     from ..jobs.store import to_json
 
@@ -473,7 +472,7 @@ def _register_several(
         "field": None if options.network is None else field_digest(options.network),
         **{name: getattr(options, name) for name in names},
     }
-    how: dict[str, Any] = {
+    how: Fields = {
         "settings": settings,
         "textures": [] if options.textures is None else [options.textures],
         "progress": options.progress,
@@ -485,7 +484,7 @@ def _register_several(
     )
 
 
-def print_result(document: Mapping[str, Any], out: Path) -> None:
+def print_result(document: Document, out: Path) -> None:
     """Print a :func:`~curvireg_torch.jobs.documents.result_document`; ``out`` is the folder
     of its files."""
     from ..registration.confidence import two_decimals
@@ -526,7 +525,7 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     )
 
 
-def _print_objects(document: Mapping[str, Any]) -> None:
+def _print_objects(document: Document) -> None:
     """Print where objects were detected, and the confidence of each if there are several."""
     from ..registration.confidence import two_decimals
     from ..visualization.words import corners
@@ -546,20 +545,20 @@ def _print_objects(document: Mapping[str, Any]) -> None:
         )
 
 
-def _place(pose: Mapping[str, Any], document: Mapping[str, Any]) -> str:
+def _place(pose: Document, document: Document) -> str:
     """The translation of an instance, behind its angles; "" without a camera."""
     if pose["translation"] is None:
         return ""
     return f", at {', '.join(f'{v:.4g}' for v in pose['translation'])} {document['unit']}"
 
 
-def _angles(pose: Mapping[str, Any]) -> str:
+def _angles(pose: Document) -> str:
     return (
         ", ".join(f"{name} {value:.1f}" for name, value in pose["viewpoint"].items()) + " degrees"
     )
 
 
-def _print_rivals(document: Mapping[str, Any]) -> None:
+def _print_rivals(document: Document) -> None:
     """Print rivals that are nearly as probable as the best pose, if there are any."""
     from ..registration.confidence import two_decimals
     from ..registration.result import likely_rivals
@@ -590,7 +589,7 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
     print(f"the poses {words[document['ambiguous']]}; {none}; {decides}")
 
 
-def _advice(document: Mapping[str, Any]) -> str:
+def _advice(document: Document) -> str:
     """What to try after a registration that is not reliable, by the reason that was measured, if
     there is one."""
     mesh = "that the mesh is the object's, in its --unit and with its --up axis"
@@ -613,8 +612,7 @@ def _advice(document: Mapping[str, Any]) -> str:
         return f"{suspicion}; and check {mesh}"
     if (features.get("undetermined") or 0.0) >= OPEN_AXES:
         return (
-            f"the contours that were found leave its rotation open: take a sharper or closer "
-            f"one, "
+            "the contours that were found leave its rotation open: take a sharper or closer one, "
             f"and check {mesh}"
         )
     if document["verdict"] == "unsure":
@@ -625,7 +623,7 @@ def _advice(document: Mapping[str, Any]) -> str:
     return f"check that the box is tight, and {mesh}"
 
 
-def _suspicious_box(inputs: Mapping[str, Any]) -> str:
+def _suspicious_box(inputs: Document) -> str:
     """What a box of an answer that is not reliable may be instead of px of the photograph as it is
     shown; "" without a suspicion."""
     box = inputs.get("box")

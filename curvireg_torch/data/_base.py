@@ -1,7 +1,6 @@
 """Base class of the datasets: dict samples, images read on access, a record of skipped objects."""
 
 import operator
-import os
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -13,9 +12,10 @@ from torch.utils.data import Dataset
 
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import rotation_from_viewpoint
+from ..utils.aliases import Fields, PathName
 from .images import read_image
 
-Sample = dict[str, Any]
+Sample = Fields
 JointTransform = Callable[[Any, Sample], tuple[Any, Sample]]
 
 
@@ -129,7 +129,7 @@ def _is_of_another_size(pixels: Any, image: Tensor) -> bool:
     return isinstance(pixels, Tensor) and pixels.ndim >= 2 and pixels.shape[-2:] != image.shape[-2:]
 
 
-def existing_root(root: str | os.PathLike[str], readme: str) -> Path:
+def existing_root(root: PathName, readme: str) -> Path:
     """``root`` as a path, if it is a folder."""
     path = Path(root)
     if not path.is_dir():

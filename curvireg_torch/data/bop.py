@@ -1,7 +1,6 @@
 """Datasets in the layout of the BOP challenge (scenewise)."""
 
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Unpack
@@ -11,6 +10,7 @@ import torch
 from ..errors import InvalidInputError, MissingFileError
 from ..formats.cameras.record import flattened
 from ..geometry.cameras import projected_boxes, transform
+from ..utils.aliases import Fields, PathName
 from ..utils.checks import check_camera_matrix, check_rotation
 from ..utils.files import finite_numbers, read_json, without_zeros
 from ._base import (
@@ -23,6 +23,8 @@ from ._base import (
 )
 from .bop_models import BOPModels
 
+Matrix = tuple[tuple[float, ...], ...]
+Counts = dict[tuple[int, int, int], int]
 _README = "datasets/bop/README.md"
 _TRUTH = "scene_gt"
 _UNKNOWN_BOX = (math.nan,) * 4
@@ -73,7 +75,7 @@ class BOPDataset(ObjectDataset):
 
     def __init__(
         self,
-        root: str | os.PathLike[str],
+        root: PathName,
         split: str = "test",
         *,
         targets: bool | None = None,
@@ -127,17 +129,14 @@ class BOPDataset(ObjectDataset):
             width = diameter * item["camera_matrix"][0][0] / max(depth, 1e-9)
             if 0 < width < 1.0:
                 message = (
-                    f"at the pose of image {item['image_id']} the mesh is {width:.2g} px "
-                    f"wide: in "
-                    f"metres? "
+                    f"at the pose of image {item['image_id']} the mesh is {width:.2g} px wide: in "
+                    "metres? scale it to mm, as the poses are"
                 )
-                raise InvalidInputError(
-                    f"{message}scale it to mm, as the poses are", subject=item["model_path"]
-                )
+                raise InvalidInputError(message, subject=item["model_path"])
 
-    def _index(self, folder: Path, counts: dict[tuple[int, int, int], int] | None) -> None:
+    def _index(self, folder: Path, counts: Counts | None) -> None:
         scene = f"{self.split}/{folder.name}"
-        contents: list[dict[str, Any]] = []
+        contents: list[Fields] = []
         for name in ("scene_gt.json", "scene_camera.json", "scene_gt_info.json"):
             try:
                 content = read_json(folder / name, dict, _README)
@@ -163,12 +162,8 @@ class BOPDataset(ObjectDataset):
                 if isinstance(parsed, str):
                     self._skip(parsed, f"{item} #{index}")
                 else:
-                    ids = {
-                        "scene_id": int(folder.name),
-                        "image_id": int(key),
-                        "instance_index": index,
-                    }
-                    samples.append({**parsed, **ids, "image_path": str(image)})
+                    ids = {"image_id": int(key), "instance_index": index, "image_path": str(image)}
+                    samples.append({**parsed, "scene_id": int(folder.name), **ids})
             for sample in _mark_targets(samples, counts):
                 item_name = f"{item} #{sample['instance_index']}"
                 if sample.pop("no_target"):
@@ -179,19 +174,18 @@ class BOPDataset(ObjectDataset):
                     self._items.append(sample)
         return None
 
-    def _parse(self, entry: object, info: dict[str, Any], camera: object) -> Sample | str:
+    def _parse(self, entry: object, info: Fields, camera: object) -> Sample | str:
         """The sample of one instance, or the reason to skip it."""
         if not isinstance(entry, dict) or not isinstance(entry.get("obj_id"), int):
             return "corrupt_annotation"
         if not isinstance(camera, dict):
             return "missing_annotation"
-        rotation = finite_numbers(flattened(entry.get("cam_R_m2c")), 9)
+        rotation = _rotation(entry.get("cam_R_m2c"))
         translation = finite_numbers(flattened(entry.get("cam_t_m2c")), 3)
         matrix = finite_numbers(flattened(camera.get("cam_K")), 9)
         if rotation is None or translation is None or matrix is None:
             return "corrupt_annotation"
         try:
-            check_rotation(torch.tensor(_rows(rotation), dtype=torch.float64), "cam_R_m2c")
             check_camera_matrix(torch.tensor(_rows(matrix), dtype=torch.float64), "cam_K")
         except InvalidInputError:
             return "corrupt_annotation"
@@ -199,7 +193,7 @@ class BOPDataset(ObjectDataset):
         box = (
             bop_box(info["bbox_obj"])
             if "bbox_obj" in info
-            else self._box_of_mesh(obj_id, rotation, translation, matrix)
+            else self._box_of_mesh(obj_id, rotation, translation, _rows(matrix))
         )
         if box is None or box[0] == box[2] or box[1] == box[3]:
             return "bad_box"
@@ -213,7 +207,7 @@ class BOPDataset(ObjectDataset):
             "box": box,
             "box_visible": bop_box(info.get("bbox_visib")) or _UNKNOWN_BOX,
             "camera_matrix": _rows(matrix),
-            "rotation": _rows(rotation),
+            "rotation": rotation,
             "translation": translation,
             "T_cam_from_world": _camera_pose(camera),
             "obj_id": obj_id,
@@ -223,21 +217,17 @@ class BOPDataset(ObjectDataset):
         }
 
     def _box_of_mesh(
-        self, obj_id: int, *pose_and_camera: tuple[float, ...]
+        self, obj_id: int, *pose_and_camera: Sequence[Any]
     ) -> tuple[float, ...] | None:
-        """The box around the mesh at a pose: 9, 3 and 9 numbers of rotation, translation and
+        """The box around the mesh at a pose: (3, 3), (3,) and (3, 3) of rotation, translation and
         camera; None behind the camera, NaN without a mesh."""
         hull = self._models.hull(obj_id) if obj_id in self._models.files else None
         if hull is None:
             return _UNKNOWN_BOX
         R, t, K = (torch.tensor(numbers, dtype=torch.float64) for numbers in pose_and_camera)
-        points = hull @ R.view(3, 3).T + t
-        if float(points[:, 2].min()) <= 0:
+        if float((hull @ R.T + t)[:, 2].min()) <= 0:
             return None
-        box: tuple[float, ...] = tuple(
-            projected_boxes(hull, transform(R.view(3, 3), t), K.view(3, 3)).tolist()
-        )
-        return box
+        return tuple(projected_boxes(hull, transform(R, t), K).tolist())
 
 
 def _missing_split(root: Path, scenes: Path) -> MissingFileError:
@@ -280,19 +270,27 @@ def _images_by_number(scene: Path) -> dict[int, Path]:
     return found
 
 
-def _camera_pose(camera: dict[str, Any]) -> tuple[tuple[float, ...], ...]:
+def _camera_pose(camera: Fields) -> Matrix:
     """(4, 4) pose of the world in a camera of ``scene_camera.json``, NaN if it is not given or not
     rigid."""
-    rotation = finite_numbers(camera.get("cam_R_w2c"), 9)
+    rotation = _rotation(camera.get("cam_R_w2c"))
     translation = finite_numbers(camera.get("cam_t_w2c"), 3)
+    if rotation is None or translation is None:
+        return ((math.nan,) * 4,) * 4
+    rows = zip(rotation, translation, strict=True)
+    return *((*row, t) for row, t in rows), (0.0, 0.0, 0.0, 1.0)
+
+
+def _rotation(values: object) -> Matrix | None:
+    """The rotation of 9 numbers; None if they are none."""
+    numbers = finite_numbers(flattened(values), 9)
+    if numbers is None:
+        return None
     try:
-        if rotation is not None and translation is not None:
-            check_rotation(torch.tensor(_rows(rotation), dtype=torch.float64), "cam_R_w2c")
-            rows = zip(_rows(rotation), translation, strict=True)
-            return *((*row, t) for row, t in rows), (0.0, 0.0, 0.0, 1.0)
+        check_rotation(torch.tensor(_rows(numbers), dtype=torch.float64), "rotation")
     except InvalidInputError:
-        pass
-    return ((math.nan,) * 4,) * 4
+        return None
+    return _rows(numbers)
 
 
 def bop_box(values: object) -> tuple[float, ...] | None:
@@ -303,7 +301,7 @@ def bop_box(values: object) -> tuple[float, ...] | None:
     return numbers[0], numbers[1], numbers[0] + numbers[2], numbers[1] + numbers[3]
 
 
-def _targets(path: Path) -> dict[tuple[int, int, int], int]:
+def _targets(path: Path) -> Counts:
     """(scene_id, im_id, obj_id) -> number of instances to estimate."""
     counts = {}
     for entry in read_json(path, list, _README):
@@ -316,9 +314,7 @@ def _targets(path: Path) -> dict[tuple[int, int, int], int]:
     return counts
 
 
-def _mark_targets(
-    samples: list[Sample], counts: dict[tuple[int, int, int], int] | None
-) -> list[Sample]:
+def _mark_targets(samples: list[Sample], counts: Counts | None) -> list[Sample]:
     """Set ``no_target`` of the samples of one image, and remove its targets from ``counts``."""
     keys = [(s["scene_id"], s["image_id"], s["obj_id"]) for s in samples]
     remaining = {key: math.inf if counts is None else counts.pop(key, 0) for key in set(keys)}
@@ -330,11 +326,11 @@ def _mark_targets(
     return samples
 
 
-def entry_at(infos: object, index: int) -> dict[str, Any]:
+def entry_at(infos: object, index: int) -> Fields:
     """Entry ``index`` of an image's list in ``scene_gt_info.json``, empty if there is none."""
     entry = infos[index] if isinstance(infos, list) and index < len(infos) else None
     return entry if isinstance(entry, dict) else {}
 
 
-def _rows(values: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
+def _rows(values: tuple[float, ...]) -> Matrix:
     return values[:3], values[3:6], values[6:]

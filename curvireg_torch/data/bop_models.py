@@ -3,7 +3,6 @@
 import re
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from ..errors import CurviregError, CurviregWarning, InvalidInputError, MissingFileError
 from ..geometry import symmetry_transforms
+from ..utils.aliases import Fields
 from ..utils.checks import check_symmetries
 from ..utils.files import finite_numbers, read_json
 
@@ -85,7 +85,7 @@ class BOPModels:
         step = -(-len(hull) // MAX_HULL_POINTS)
         return float(pdist(hull[::step].numpy()).max())
 
-    def _measured(self, number: int) -> dict[str, Any]:
+    def _measured(self, number: int) -> Fields:
         """An entry as models_info.json has it, without symmetries."""
         hull = self.hull(number)
         assert hull is not None
@@ -106,13 +106,10 @@ class BOPModels:
             if not 1.0 / MAX_UNIT_FACTOR < measured / listed < MAX_UNIT_FACTOR:
                 metres = "in metres? " if 500 < listed / measured < 2000 else ""
                 message = (
-                    f"the mesh is {measured:.4g} across, models_info.json says "
-                    f"{listed:.4g}: "
-                    f"{metres}"
+                    f"the mesh is {measured:.4g} across, models_info.json says {listed:.4g}: "
+                    f"{metres}scale the models to mm, as the poses are"
                 )
-                raise InvalidInputError(
-                    f"{message}scale the models to mm, as the poses are", subject=self.files[number]
-                )
+                raise InvalidInputError(message, subject=self.files[number])
             return
 
 
@@ -125,7 +122,7 @@ def model_files(folder: Path) -> dict[int, Path]:
     return {int(match[1]): path for match, path in matches if match}
 
 
-def read_models_info(path: Path) -> dict[int, dict[str, Any]]:
+def read_models_info(path: Path) -> dict[int, Fields]:
     """obj_id -> entry, each with a diameter and symmetries that metrics can use."""
     entries = {}
     for key, entry in read_json(path, dict, README).items():

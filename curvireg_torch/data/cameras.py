@@ -1,15 +1,14 @@
 """Calibration files as cameras of the library."""
 
-import os
-
 import torch
 
 from ..errors import InvalidInputError
 from ..formats.cameras import CameraFiles
 from ..geometry.calibration import Camera
+from ..utils.aliases import PathName
 
 
-def load_camera(path: str | os.PathLike[str]) -> Camera:
+def load_camera(path: PathName) -> Camera:
     """The camera of a calibration file, ``FILE`` or ``FILE:NAME``; ``read_camera`` names the
     formats.
 
@@ -37,7 +36,7 @@ class Calibrations:
     def __init__(self) -> None:
         self._files = CameraFiles()
 
-    def load(self, path: str | os.PathLike[str]) -> Camera:
+    def load(self, path: PathName) -> Camera:
         """:func:`load_camera`."""
         record = self._files.read(path)
         try:

@@ -1,17 +1,15 @@
 """Photographs and frames of videos from disk."""
 
 import math
-import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import MAX_IMAGE_PIXELS, ImageError
@@ -25,6 +23,7 @@ from ..formats.pictures import (
 )
 from ..geometry.calibration import Camera
 from ..geometry.cameras import camera_matrix
+from ..utils.aliases import Array, Bytes, Fields, PathName, Size
 from ..utils.checks import check_integer
 from ..utils.pictures import check_pixels, damaged_picture
 
@@ -77,7 +76,7 @@ class Photo:
     orientation: int
     focal_35mm: float | None
     notes: tuple[str, ...]
-    taken_size: tuple[int, int] | None = None
+    taken_size: Size | None = None
     digital_zoom: float = 1.0
     is_stitched: bool = False
 
@@ -94,11 +93,10 @@ class Photo:
     def is_cropped(self) -> bool:
         """Whether the proportions of the pixels differ from those of the picture that the camera
         took."""
-        H, W = self.image.shape[-2:]
-        longer = max(H, W)
-        shorter = min(H, W)
         if self.taken_size is None:
             return False
+        longer = max(self.image.shape[-2:])
+        shorter = min(self.image.shape[-2:])
         taken = max(self.taken_size) / min(self.taken_size)
         return abs(shorter * taken - longer) > 1.0 + taken
 
@@ -129,19 +127,18 @@ class Photo:
         deviation = math.hypot(EXIF_DEVIATION, math.log(self.digital_zoom) / 2)
         return None if K is None else Camera(K, focal_deviation=deviation, source="exif")
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> Fields:
         """Return all but the pixels, as plain JSON."""
-        H, W = self.image.shape[-2:]
-        facts = {
-            "width": W,
-            "height": H,
+        return {
+            "width": self.image.shape[-1],
+            "height": self.image.shape[-2],
             "orientation": self.orientation,
             "focal_35mm": self.focal_35mm,
+            "notes": list(self.notes),
         }
-        return {**facts, "notes": list(self.notes)}
 
 
-def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Photo:
+def read_photo(path: PathName, *, as_stored: bool = False) -> Photo:
     """Read a photograph as viewers show it: the EXIF orientation is applied, and boxes refer to the
     result.
 
@@ -165,7 +162,8 @@ def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Phot
         >>> photo.image.shape, int(photo.image[0, 0, 0]), photo.notes
         (torch.Size([3, 4, 6]), 51, ('grey: three equal channels',))
     """
-    return _photo(*_decode(Path(path)), as_stored=as_stored)
+    found, _ = decoded(Path(path), lambda image, _, data: _decoded(image, data))
+    return _photo(*found, as_stored=as_stored)
 
 
 def photo_of_picture(image: "Image") -> Photo:
@@ -186,7 +184,7 @@ def photo_of_picture(image: "Image") -> Photo:
 
 
 def _photo(
-    rgb: NDArray[np.uint8], exif: "Metadata", notes: tuple[str, ...], *, as_stored: bool = False
+    rgb: Bytes, exif: "Metadata", notes: tuple[str, ...], *, as_stored: bool = False
 ) -> Photo:
     orientation = 1 if as_stored else exif.orientation
     if orientation != 1:
@@ -194,18 +192,11 @@ def _photo(
     if exif.digital_zoom > 1.0:
         notes = (*notes, f"digital zoom {exif.digital_zoom:.3g}: perhaps not in the focal length")
     pixels = torch.from_numpy(np.array(oriented(rgb, orientation).transpose(2, 0, 1), order="C"))
-    return Photo(
-        pixels,
-        orientation,
-        exif.focal_35mm,
-        notes,
-        taken_size=exif.taken_size,
-        digital_zoom=exif.digital_zoom,
-        is_stitched=exif.is_stitched,
-    )
+    shown = exif._replace(orientation=orientation)
+    return Photo(pixels, notes=notes, **shown._asdict())
 
 
-def read_image(path: str | os.PathLike[str]) -> Tensor:
+def read_image(path: PathName) -> Tensor:
     """Read a photograph as it is stored, to which the boxes of datasets refer, as (3, H, W) float32
     RGB in [0, 1].
 
@@ -225,19 +216,15 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     return read_photo(path, as_stored=True).image.float().div_(255.0)
 
 
-def _decode(path: Path) -> tuple[NDArray[np.uint8], Metadata, tuple[str, ...]]:
+def _decoded(image: "Image", data: bytes) -> tuple[Bytes, Metadata, tuple[str, ...]]:
     """(H, W, 3) RGB pixels as stored, metadata, and notes."""
-    return decoded(path, lambda image, _, data: _decoded(image, data))[0]
-
-
-def _decoded(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], Metadata, tuple[str, ...]]:
     notes = _notes(image)
     exif = picture_metadata(image, data)
     rgb, stretched = _rgb_pixels(image, data)
     return as_in_file(rgb, image, exif.orientation), exif, (*notes, *stretched)
 
 
-def _rgb_pixels(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
+def _rgb_pixels(image: "Image", data: bytes) -> tuple[Bytes, tuple[str, ...]]:
     """(H, W, 3), and notes; the largest value that the file's format can hold becomes 255, but of
     16 bits of which the upper ones are empty, as cameras of 10 and 12 bits write them, the largest
     of the used bits."""
@@ -285,7 +272,7 @@ def _is_deep(image: "Image", data: bytes) -> bool:
     return bool(tags.get(_BITS, (8,))[0] == 16)
 
 
-def _used_bits(values: NDArray[Any], bits: int) -> int:
+def _used_bits(values: Array, bits: int) -> int:
     """The bits that hold all values, 8, 10, 12 or 14; ``bits`` of a black picture, and where more
     are needed."""
     largest = int(values.max(initial=0))
@@ -293,13 +280,10 @@ def _used_bits(values: NDArray[Any], bits: int) -> int:
     return fewer[0] if fewer and largest else bits
 
 
-def _eight_bits(values: NDArray[Any], bits: int) -> NDArray[np.uint8]:
+def _eight_bits(values: Array, bits: int) -> Bytes:
     """Values of ``bits`` bits, rounded to 8."""
     largest = 2**bits - 1
-    rounded: NDArray[np.uint8] = (
-        (values.astype(np.uint32) * 255 + largest // 2) // largest
-    ).astype(np.uint8)
-    return rounded
+    return np.asarray((values.astype(np.uint32) * 255 + largest // 2) // largest, np.uint8)
 
 
 def _stretched(used: int, bits: int) -> tuple[str, ...]:
@@ -316,6 +300,11 @@ def _notes(image: "Image") -> tuple[str, ...]:
         ANIMATED: getattr(image, "is_animated", False) and image.format != "MPO",
     }
     return tuple(text for text, applies in notes.items() if applies)
+
+
+def frame_tensor(pixels: Array) -> Tensor:
+    """(3, H, W) RGB of a frame (H, W, 3) as OpenCV has it."""
+    return torch.from_numpy(np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1)))
 
 
 _CONTAINERS = re.compile(
@@ -368,10 +357,7 @@ class Video:
                 raise ImageError(
                     f"frame {number} cannot be read; save the video again", subject=self.path
                 )
-            yield (
-                number,
-                torch.from_numpy(np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1))),
-            )
+            yield number, frame_tensor(pixels)
 
     def numbers(self) -> list[int]:
         """Return the numbers of the frames that are yielded, which are counted: ``count`` may be

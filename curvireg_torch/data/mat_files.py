@@ -14,12 +14,12 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import MAX_MAT_BYTES, InvalidInputError
+from ..utils.aliases import Floats
 
 MatStruct = dict[str, "MatValue"]
-MatValue = list[MatStruct] | str | NDArray[np.float64] | None
+MatValue = list[MatStruct] | str | Floats | None
 """A struct array, a text, real numbers in MATLAB's column order, or None for any other type."""
 
 MAX_DEPTH = 16

@@ -2,7 +2,6 @@
 ImageNet."""
 
 import math
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Unpack
@@ -10,6 +9,7 @@ from typing import Unpack
 import numpy as np
 
 from ..errors import InvalidInputError, MissingFileError
+from ..utils.aliases import PathName
 from ..utils.checks import check_option
 from ._base import (
     IMAGE_SUFFIXES,
@@ -74,7 +74,7 @@ class Pascal3DPlus(ObjectDataset):
 
     def __init__(
         self,
-        root: str | os.PathLike[str],
+        root: PathName,
         split: str = "val",
         *,
         categories: Iterable[str] | None = None,
@@ -109,21 +109,15 @@ class Pascal3DPlus(ObjectDataset):
             self._index(category)
 
     def _list_files(self, category: str) -> list[Path]:
-        voc = (
-            [self.root / _VOC_LISTS / f"{category}_{self.split}.txt"]
-            if self.part == "pascal"
-            else []
-        )
-        return [*voc, self.root / "Image_sets" / f"{category}_{self.part}_{self.split}.txt"]
+        own = self.root / "Image_sets" / f"{category}_{self.part}_{self.split}.txt"
+        voc = self.root / _VOC_LISTS / f"{category}_{self.split}.txt"
+        return [voc, own] if self.part == "pascal" else [own]
 
     def _listed(self) -> list[str]:
         ending = f"_{self.part}"
-        folders = [
-            p.name.removesuffix(ending)
-            for p in (self.root / "Annotations").glob("*" + ending)
-            if p.is_dir()
-        ]
-        names = [name for name in folders if any(p.is_file() for p in self._list_files(name))]
+        folders = filter(Path.is_dir, (self.root / "Annotations").glob(f"*{ending}"))
+        found = [folder.name.removesuffix(ending) for folder in folders]
+        names = [name for name in found if any(map(Path.is_file, self._list_files(name)))]
         if not names:
             raise MissingFileError(
                 f"no {self.part} image list for split {self.split!r}; {_README} shows the layout",
@@ -134,11 +128,9 @@ class Pascal3DPlus(ObjectDataset):
     def _ids(self, category: str) -> list[str]:
         for path in self._list_files(category):
             if path.is_file():
-                lines = [
-                    line.split()
-                    for line in path.read_text(encoding="utf-8", errors="replace").splitlines()
-                ]
-                return [fields[0] for fields in lines if fields and fields[1:2] != ["-1"]]
+                text = path.read_text(encoding="utf-8", errors="replace")
+                rows = map(str.split, text.splitlines())
+                return [row[0] for row in rows if row and row[1:2] != ["-1"]]
         names = " or ".join(str(p.relative_to(self.root)) for p in self._list_files(category))
         raise MissingFileError(
             f"no image list {names}; {_README} shows the layout", subject=self.root
@@ -220,16 +212,14 @@ def _number(value: MatValue) -> float | None:
     return float(value[0])
 
 
-def _box(value: MatValue, origin: int) -> tuple[float, float, float, float] | None:
+def _box(value: MatValue, origin: int) -> tuple[float, ...] | None:
     if not isinstance(value, np.ndarray) or value.size != 4 or not np.isfinite(value).all():
         return None
     x0, y0, x1, y1 = (float(v) - origin for v in value)
     return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
 
 
-def _camera(
-    view: MatStruct, box: tuple[float, float, float, float], origin: int
-) -> tuple[tuple[float, ...], ...]:
+def _camera(view: MatStruct, box: tuple[float, ...], origin: int) -> tuple[tuple[float, ...], ...]:
     """K of the annotation. Defaults: focal 1, viewport 3000, principal point at the centre of the
     box."""
     focal = (_number(view.get("focal")) or 1.0) * (_number(view.get("viewport")) or 3000.0)

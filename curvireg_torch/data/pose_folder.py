@@ -1,11 +1,11 @@
 """Folders of the user: objects, each with a mesh and photographs of known or unknown pose."""
 
 import math
-import os
 from pathlib import Path
 from typing import Unpack
 
 from ..errors import InvalidInputError, MissingFileError
+from ..utils.aliases import PathName
 from ..utils.choices import MESHES
 from ..utils.files import read_csv
 from ._base import ObjectDataset, Sample, Transforms, existing_root, is_plain_name, pose_fields
@@ -49,7 +49,7 @@ class PoseFolder(ObjectDataset):
 
     def __init__(
         self,
-        root: str | os.PathLike[str],
+        root: PathName,
         **functions: Unpack[Transforms],
     ) -> None:
         super().__init__(existing_root(root, _README), **functions)
@@ -65,9 +65,7 @@ class PoseFolder(ObjectDataset):
             self._index(folder)
 
     def _index(self, folder: Path) -> None:
-        meshes = [
-            folder / f"mesh{suffix}" for suffix in MESHES if (folder / f"mesh{suffix}").is_file()
-        ]
+        meshes = [*filter(Path.is_file, (folder / f"mesh{suffix}" for suffix in MESHES))]
         if len(meshes) > 1:
             raise InvalidInputError(
                 f"expected one mesh, got {', '.join(p.name for p in meshes)}", subject=folder

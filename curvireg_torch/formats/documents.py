@@ -15,12 +15,12 @@ import numpy as np
 import yaml
 
 from ..errors import InvalidInputError
+from ..utils.aliases import Fields
 from ..utils.files import foreign_content
 
 EXPECTED = (
     "YAML, XML or JSON of OpenCV, camera_info of ROS, camchain of Kalibr, cameras.txt of COLMAP, "
-    "camera.json of BOP, "
-    "cam_K.txt of 3 x 3 numbers"
+    "camera.json of BOP, cam_K.txt of 3 x 3 numbers"
 )
 MAX_DEPTH = 50  # of nested lists and keys
 # of an array in an .npz file; larger ones are points of the calibration, and left out
@@ -105,7 +105,7 @@ def number(text: str) -> float | str:
         return text.strip("\"'")
 
 
-def _arrays(data: bytes) -> dict[str, Any]:
+def _arrays(data: bytes) -> Fields:
     """Small arrays of numbers in a file of ``numpy.savez`` or ``numpy.save``, by their names."""
     try:
         if not data.startswith(b"PK"):
@@ -148,7 +148,7 @@ def _array(data: bytes) -> Any:
     return np.load(BytesIO(data), allow_pickle=False).astype(np.float64).tolist()
 
 
-def _colmap(text: str) -> dict[str, Any]:
+def _colmap(text: str) -> Fields:
     """The words of each line of ``cameras.txt``, by the camera's number."""
     lines = enumerate((line.partition("#")[0].split() for line in text.splitlines()), start=1)
     return {words[0]: {"colmap": words, "line": count} for count, words in lines if words}
@@ -175,7 +175,7 @@ def _xml(text: str) -> Any:
         if not len(element) and (words := (element.text or "").split()):
             numbers = [number(word) for word in words]
             return numbers[0] if len(numbers) == 1 else numbers
-        values: dict[str, Any] = {name: number(text) for name, text in element.attrib.items()}
+        values: Fields = {name: number(text) for name, text in element.attrib.items()}
         for child in element:
             inside = value(child)
             several = values.get(child.tag)

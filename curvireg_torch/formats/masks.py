@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import ImageError, InvalidInputError, MissingFileError
+from ..utils.aliases import Array, PathName, Singles
 from .boxes import PictureSize
 from .pictures import as_in_file, decoded, oriented
 
@@ -18,7 +18,7 @@ MAX_LABEL = 127  # of a picture of 8 bits that counts as one of labels: brighter
 MAX_LISTED = 12  # labels that a message names
 
 
-def mask_file(mask: str | os.PathLike[str]) -> tuple[Path, int | None]:
+def mask_file(mask: PathName) -> tuple[Path, int | None]:
     """The file and the label of ``FILE`` or ``FILE:LABEL``.
 
     Example:
@@ -31,7 +31,7 @@ def mask_file(mask: str | os.PathLike[str]) -> tuple[Path, int | None]:
     return Path(mask), None
 
 
-def read_mask(mask: str | os.PathLike[str]) -> NDArray[np.float32]:
+def read_mask(mask: PathName) -> Singles:
     """(H, W) in [0, 1], 1 = object, of a picture in which the object is white, or one of several
     labels.
 
@@ -78,7 +78,7 @@ def mask_as_shown(mask: Any, picture: PictureSize) -> Any:
     return np.array(oriented(values[..., None], picture.orientation)[..., 0])
 
 
-def mask_of_values(values: NDArray[Any], largest: int) -> NDArray[np.float32]:
+def mask_of_values(values: Array, largest: int) -> Singles:
     """(H, W) in [0, 1] of a picture's values, of which ``largest`` is white; of a label image, of
     its only label."""
     if values.size == 0 or int(values.max()) > largest * MAX_LABEL / 255:
@@ -97,7 +97,7 @@ def mask_of_values(values: NDArray[Any], largest: int) -> NDArray[np.float32]:
     return np.zeros(values.shape, np.float32)
 
 
-def _labelled(values: NDArray[Any], label: int, file: Path) -> NDArray[np.float32]:
+def _labelled(values: Array, label: int, file: Path) -> Singles:
     chosen = np.equal(values, label)
     if not chosen.any():
         labels = np.unique(values)
@@ -110,13 +110,13 @@ def _labelled(values: NDArray[Any], label: int, file: Path) -> NDArray[np.float3
     return np.asarray(chosen, dtype=np.float32)
 
 
-def _values(image: "Image", orientation: int, _: bytes) -> tuple[NDArray[Any], int]:
+def _values(image: "Image", orientation: int, _: bytes) -> tuple[Array, int]:
     """(H, W, 1) values of an open picture, as they are stored, and the value of white."""
     values, largest = _grey(image)
     return as_in_file(values[..., None], image, orientation), largest
 
 
-def _grey(image: "Image") -> tuple[NDArray[Any], int]:
+def _grey(image: "Image") -> tuple[Array, int]:
     if image.mode == "P":
         indices = np.asarray(image)
         colours = np.asarray(image.convert("RGB")).max(axis=2)

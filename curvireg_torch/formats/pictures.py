@@ -7,9 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from numpy.typing import NDArray
-
 from ..errors import MAX_IMAGE_BYTES, CurviregError, ImageError, MissingFileError
+from ..utils.aliases import Array, Size
 from ..utils.pictures import check_pixels, damaged_picture
 from .boxes import PictureSize
 from .heif import open_photograph
@@ -51,7 +50,7 @@ class Metadata(NamedTuple):
 
     orientation: int
     focal_35mm: float | None
-    taken_size: tuple[int, int] | None
+    taken_size: Size | None
     digital_zoom: float
     is_stitched: bool
 
@@ -60,7 +59,7 @@ def picture_size(path: Path) -> PictureSize:
     """The size of a photograph as :func:`read_photo` shows it, from its header; errors are the
     same."""
 
-    def stored_size(image: "Image", *_: object) -> tuple[int, int]:
+    def stored_size(image: "Image", *_: object) -> Size:
         # of a TIFF, whose size Pillow turns or not, by its version
         tags = getattr(image, "tag_v2", {})
         return int(tags.get(_WIDTH, image.width)), int(tags.get(_HEIGHT, image.height))
@@ -95,7 +94,7 @@ def decoded(path: Path, read: Callable[["Image", int, bytes], T]) -> tuple[T, in
         raise damaged_picture(error).with_subject(path) from error
 
 
-def as_in_file(pixels: NDArray[Any], image: "Image", orientation: int) -> NDArray[Any]:
+def as_in_file(pixels: Array, image: "Image", orientation: int) -> Array:
     """(H, W, C) decoded pixels as they are stored: Pillow applies the orientation of a TIFF, which
     is taken back."""
     return (
@@ -105,7 +104,7 @@ def as_in_file(pixels: NDArray[Any], image: "Image", orientation: int) -> NDArra
     )
 
 
-def oriented(x: NDArray[Any], orientation: int) -> NDArray[Any]:
+def oriented(x: Array, orientation: int) -> Array:
     """Stored (H, W, C) pixels as viewers show them, for an EXIF orientation."""
     x = x[:: -1 if orientation in (3, 4, 6, 7) else 1, :: -1 if orientation in (2, 3, 7, 8) else 1]
     return x.swapaxes(0, 1) if orientation > 4 else x
@@ -157,7 +156,7 @@ def _xmp(image: "Image") -> bytes:
     return found if isinstance(found, bytes) else str(found).encode()
 
 
-def _focal_by_sensor(directory: Mapping[int, Any], size: tuple[int, int]) -> float:
+def _focal_by_sensor(directory: Mapping[int, Any], size: Size) -> float:
     """The focal length in mm of a 36 x 24 mm camera of the same view, from that of the lens and the
     distance of the sensor's pixels; 0 where they are not stated, or no sensor has this size."""
     unit = _SENSOR_UNITS_MM[int(directory.get(_SENSOR_UNIT, 2))]

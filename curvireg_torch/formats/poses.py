@@ -1,7 +1,7 @@
 """Files of one pose: results of this library, and those of other tools."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ import numpy as np
 from trimesh.transformations import quaternion_matrix
 
 from ..errors import InvalidInputError, MissingFileError
-from ..utils.arrays import Floats
+from ..utils.aliases import Document, Floats
 from ..utils.files import check_table_size, finite_numbers, split_name
 from .cameras.record import flattened, plain
 from .documents import read_document
@@ -25,8 +25,7 @@ _MATRICES = set(map(plain, _MATRIX_NAMES.split()))
 _OTHER_FRAMES = re.compile(r"(^|/)(world|map|odom|base\w*|earth|\w*_link)$")
 FORMATS = (
     "JSON with rotation and translation, or T_cam_from_model; 4 x 4 numbers; TWO of MegaPose; "
-    "scene_gt.json:IMAGE_ID "
-    "of BOP; pose.yaml of ROS"
+    "scene_gt.json:IMAGE_ID of BOP; pose.yaml of ROS"
 )
 
 
@@ -168,7 +167,7 @@ def _transform(R: Floats, t: Floats) -> Floats:
     return T
 
 
-def _rotation_and_translation(content: Mapping[str, Any]) -> PoseRecord:
+def _rotation_and_translation(content: Document) -> PoseRecord:
     if content.get("frame") == "world":
         raise InvalidInputError(
             "a result of several photographs, whose pose is in the world; give that in one "
@@ -189,19 +188,19 @@ def _rotation_and_translation(content: Mapping[str, Any]) -> PoseRecord:
     return PoseRecord(_transform(R, t), None, _confidence(content))
 
 
-def _confidence(content: Mapping[str, Any]) -> float | None:
+def _confidence(content: Document) -> float | None:
     numbers = finite_numbers([content.get("confidence")], 1)
     return numbers[0] if numbers else None
 
 
-def _bop(content: Mapping[str, Any]) -> PoseRecord:
+def _bop(content: Document) -> PoseRecord:
     """An entry of scene_gt.json: millimetres."""
     R = _numbers(content.get("cam_R_m2c"), "cam_R_m2c", 9)
     t = _numbers(content.get("cam_t_m2c"), "cam_t_m2c", 3)
     return PoseRecord(_transform(R, t), "mm")
 
 
-def _megapose(content: Mapping[str, Any]) -> PoseRecord:
+def _megapose(content: Document) -> PoseRecord:
     """An entry of object_data.json: a quaternion x, y, z, w and metres, in the camera, which is the
     world."""
     numbers = _numbers(flattened(content.get("TWO")), "TWO", 7)
@@ -212,7 +211,7 @@ def _megapose(content: Mapping[str, Any]) -> PoseRecord:
     return PoseRecord(_transform(_rotation(numbers[:4], "TWO"), numbers[4:]), "m")
 
 
-def _ros(content: Mapping[str, Any]) -> PoseRecord:
+def _ros(content: Document) -> PoseRecord:
     """A PoseStamped, as ``--format ros`` writes it: metres, in the camera's optical frame."""
     header = content.get("header")
     frame = str(header.get("frame_id") or "") if isinstance(header, dict) else ""
@@ -246,7 +245,7 @@ def _rotation(quaternion: Floats, name: str) -> Floats:
     return np.asarray(quaternion_matrix(np.roll(quaternion, 1))[:3, :3])
 
 
-_READERS: dict[str, Callable[[Mapping[str, Any]], PoseRecord]] = {
+_READERS: dict[str, Callable[[Document], PoseRecord]] = {
     "camrm2c": _bop,
     "two": _megapose,
     "header": _ros,

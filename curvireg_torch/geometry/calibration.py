@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..utils.aliases import Fields, Floats, Size
 from ..utils.checks import (
     as_numbers,
     check_camera_matrix,
@@ -31,7 +31,7 @@ SOURCES = ("given", "exif", "estimated")
 MODELS = {"radial-tangential": (0, 4, 5, 8, 12, 14), "fisheye": (4,)}
 MAX_ANGLE = 1.55  # Radians from the optical axis up to which distortion is computed: 89 degrees
 MAX_REMAPPED_SIDE = 32766  # Pixels; cv2.remap counts with 16 bits
-Array = NDArray[np.float64]
+Array = Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Camera:
     matrix: Tensor
     distortion: Sequence[float] = ()
     model: str = "radial-tangential"
-    size: tuple[int, int] | None = None
+    size: Size | None = None
     focal_deviation: float = 0.0
     source: str = "given"
 
@@ -84,8 +84,7 @@ class Camera:
         numbers = finite_numbers(given, len(given))
         if numbers is None or len(numbers) not in MODELS[self.model]:
             expected = (
-                f"{' or '.join(map(str, MODELS[self.model]))} finite coefficients of the "
-                f"model "
+                f"{' or '.join(map(str, MODELS[self.model]))} finite coefficients of the model "
                 f"{self.model!r}"
             )
             raise InvalidInputError(f"distortion: expected {expected}, got {given!r:.80}")
@@ -99,7 +98,7 @@ class Camera:
         """Whether straight lines become curved."""
         return self.model == "fisheye" or any(self.distortion)
 
-    def at(self, size: tuple[int, int]) -> "Camera":
+    def at(self, size: Size) -> "Camera":
         """Return the camera of the same photographs, resized to (H, W); another aspect ratio is
         refused."""
         (h, w), (H, W) = self.size or size, size
@@ -113,8 +112,7 @@ class Camera:
             )
             raise InvalidInputError(
                 f"camera: calibrated for {w} x {h} px, but the photograph has {W} x {H} px, "
-                f"another aspect ratio; "
-                f"{advice}"
+                f"another aspect ratio; {advice}"
             )
         x = W / w
         y = H / h
@@ -123,7 +121,7 @@ class Camera:
         )
         return replace(self, matrix=scale @ self.matrix, size=size)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Fields:
         """Return the attributes as plain JSON."""
         return {
             "matrix": self.matrix.tolist(),
@@ -201,7 +199,7 @@ def undistorted(
 
 @lru_cache(maxsize=2)  # photographs of one camera, or of two in turn
 def _maps(
-    matrix: tuple[float, ...], distortion: tuple[float, ...], model: str, size: tuple[int, int]
+    matrix: tuple[float, ...], distortion: tuple[float, ...], model: str, size: Size
 ) -> tuple[tuple[Any, Any], Tensor]:
     """Maps of ``cv2.remap`` from a photograph of (H, W) to one without distortion, and (H, W) bool:
     what is missing."""
@@ -253,7 +251,7 @@ def _with_radii(points: Array, old: Array, new: Array) -> Array:
     return np.asarray(points * np.interp(distance, old, new) / np.maximum(distance, 1e-12))
 
 
-def _undistorted_box(camera: Camera, box: Tensor, size: tuple[int, int]) -> Tensor:
+def _undistorted_box(camera: Camera, box: Tensor, size: Size) -> Tensor:
     """(4,) around the undistorted outline of a box; what extends beyond the photograph moves with
     its border."""
     (H, W), K, D = size, camera.matrix.numpy(), np.array(camera.distortion)
@@ -280,7 +278,6 @@ def _undistorted_box(camera: Camera, box: Tensor, size: tuple[int, int]) -> Tens
     ):
         raise InvalidInputError(
             f"box ({x0:g}, {y0:g}, {x1:g}, {y1:g}): outside what the photograph shows once its "
-            f"distortion is removed, "
-            "too far from the optical axis; turn the camera to the object"
+            "distortion is removed, too far from the optical axis; turn the camera to the object"
         )
     return moved

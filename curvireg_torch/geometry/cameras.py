@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..utils.aliases import Size
 from ..utils.checks import (
     check_camera_matrix,
     check_finite,
@@ -36,7 +37,7 @@ def camera_matrix(
     return K
 
 
-def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
+def camera_of_view(fov: float, size: Size) -> Tensor:
     """(3, 3) float64 camera matrix of a horizontal field of view, 0 < ``fov`` < 180 degrees, and an
     (H, W) in px, with square pixels and the principal point in the centre."""
     if not (isinstance(fov, int | float) and 0.0 < fov < 180.0):

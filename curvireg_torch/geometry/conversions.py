@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..utils.aliases import Document
 from ..utils.checks import (
     check_fraction,
     check_last_axes,
@@ -94,7 +95,7 @@ def cross_matrix(vector: Tensor) -> Tensor:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(*vector.shape, 3)
 
 
-def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0.01) -> Tensor:
+def symmetry_transforms(info: Document, *, max_step_fraction: float = 0.01) -> Tensor:
     """All symmetries of an object as 4x4 transforms, from its entry in BOP's ``models_info.json``.
 
     Each discrete symmetry is followed by each rotation about each continuous axis, in
@@ -151,7 +152,7 @@ def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0
     return (torch.cat(rotations).unsqueeze(1) @ discrete).flatten(0, 1)
 
 
-def _list(info: Mapping[str, Any], key: str) -> Sequence[Any]:
+def _list(info: Document, key: str) -> Sequence[Any]:
     values = info.get(key, ())
     if not isinstance(values, list | tuple):
         raise InvalidInputError(f"{key}: expected a list, got {values!r:.80}")

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ..errors import MAX_BOX_COORDINATE, InvalidInputError
+from ..utils.aliases import Size
 from ..utils.checks import as_boxes, check_integer, check_positive, check_tensor
 from ..utils.likes import BoxesLike
 
@@ -24,7 +25,7 @@ def whole_image_box(image: Tensor) -> Tensor:
     return torch.tensor([-0.5, -0.5, W - 0.5, H - 0.5], dtype=torch.float32, device=image.device)
 
 
-def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
+def check_boxes(boxes: Tensor, sizes: Sequence[Size]) -> None:
     """Refuse (B, 4) boxes that are empty, not finite or entirely outside their image, of the (H, W)
     in ``sizes``."""
     check_tensor(boxes, "boxes", (len(sizes), 4))

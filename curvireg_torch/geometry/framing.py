@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..utils.aliases import Size
 from .cameras import boxes_around, project_points, projected
 from .crops import crop_transforms, image_transforms, square_boxes
 
@@ -19,13 +20,13 @@ HIDDEN_EXTENSIONS = (0.35, 1.0)
 VISIBLE_MARGIN = 0.05
 
 
-def photograph_box(size: tuple[int, int]) -> Tensor:
+def photograph_box(size: Size) -> Tensor:
     """(4,) float64 box of a photograph of ``size`` (H, W)."""
     height, width = size
     return torch.tensor([-0.5, -0.5, width - 0.5, height - 0.5], dtype=torch.float64)
 
 
-def clipped(box: Tensor, size: tuple[int, int]) -> Tensor:
+def clipped(box: Tensor, size: Size) -> Tensor:
     """The part of a box (4,) inside a photograph of ``size`` (H, W), which it overlaps."""
     limits = photograph_box(size).to(box)
     low = torch.maximum(box[:2], limits[:2])
@@ -33,7 +34,7 @@ def clipped(box: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.cat([low, high])
 
 
-def border_sides(box: Tensor, size: tuple[int, int]) -> int:
+def border_sides(box: Tensor, size: Size) -> int:
     """Number of sides of a box (4,) that lie on the border of a photograph of ``size`` (H, W), or
     beyond it.
 
@@ -45,14 +46,14 @@ def border_sides(box: Tensor, size: tuple[int, int]) -> int:
     return int(low.sum() + high.sum())
 
 
-def _on_border(box: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def _on_border(box: Tensor, size: Size) -> tuple[Tensor, Tensor]:
     """Which of the sides x0, y0 and of the sides x1, y1 of a box (4,) lie on the border of a
     photograph of ``size`` (H, W), or beyond it, each (2,) bool."""
     limits = photograph_box(size).to(box)
     return box[:2] <= limits[:2] + BORDER, box[2:] >= limits[2:] - BORDER
 
 
-def whole_boxes(box: Tensor, size: tuple[int, int]) -> list[Tensor]:
+def whole_boxes(box: Tensor, size: Size) -> list[Tensor]:
     """Boxes that the whole object may have whose visible part has a ``box`` (4,) in a photograph of
     ``size`` (H, W): beyond the sides on its border, it goes on by ``EXTENSIONS`` of the box's width
     or height; none where no side lies there.
@@ -88,7 +89,7 @@ def hidden_boxes(box: Tensor) -> list[Tensor]:
     return [box + extension * side for extension in HIDDEN_EXTENSIONS for side in sides.diag()]
 
 
-def around_visible(box: Tensor, size: tuple[int, int]) -> Tensor:
+def around_visible(box: Tensor, size: Size) -> Tensor:
     """(4,) the part of a photograph of ``size`` (H, W) that shows an object whose visible part has
     a ``box`` (4,)."""
     margin = VISIBLE_MARGIN * (box[2:] - box[:2]).max()
@@ -134,7 +135,7 @@ def shown_in(frame: CropFrame | None, field: Tensor) -> Tensor:
     return field if frame is None else field * frame.inside.to(field.device)
 
 
-def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> float:
+def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: Size) -> float:
     """Fraction of the outline's area that lies outside a photograph of ``size`` (H, W), in [0, 1].
 
     Args:
@@ -163,7 +164,7 @@ def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) 
     return min(max(1.0 - float(inside) / whole, 0.0), 1.0)
 
 
-def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: Size) -> tuple[Tensor, Tensor]:
     """(N, 4) boxes in px around a mesh with ``hull`` (V, 3) at poses (N, 4, 4), in an image of
     ``size`` (H, W). And (N,) bool, False where the mesh lies behind the camera, or outside the
     image: there the box means nothing."""

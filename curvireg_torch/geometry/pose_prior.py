@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..utils.aliases import Fields
 from ..utils.checks import as_numbers, check_number, check_numbers, check_option, check_rotation
 from ..utils.choices import SIDE_NAMES, UP_AXES
 from .conversions import axis_angle_from_rotation, rotation_from_axis_angle
@@ -101,7 +102,7 @@ class PosePrior:
         check_option(name, SIDES, "side")
         return cls(azimuth=((SIDES[name] - SIDE_WIDTH) % 360.0, (SIDES[name] + SIDE_WIDTH) % 360.0))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Fields:
         """The limits that are given, as plain numbers and texts."""
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         return {name: value for name, value in plain.items() if value is not None}

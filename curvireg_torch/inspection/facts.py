@@ -2,16 +2,16 @@
 words."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from ..matching.describe import VIEW_FACES
 from ..mesh import has_colours, mesh_unit, mesh_up, mesh_warnings
 from ..mesh.mesh import extreme_points, mesh_radius
+from ..utils.aliases import Fields, Floats
+from ..utils.choices import UNITS
 from .surface import POINTS, Symmetry, looks_inwards, measured_symmetries, thin_fraction
 
 # From which simplification is advised: reading and the first bank take longer than a photograph
@@ -27,7 +27,6 @@ SPHERE_SPREAD = 0.03
 # Metres across between which a mesh is an object that someone photographs
 SMALLEST = 0.005
 LARGEST = 20.0
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inches": 0.0254, "ft": 0.3048}
 ROOM = 2.0  # Metres across from which faces that look inwards are those of a room
 MUCH_THIN = 0.3  # Fraction of the surface of thin parts from which a warning says so
 CONTINUOUS_TURN = 15.0  # Degrees below which a symmetry is one of a body of revolution
@@ -73,7 +72,7 @@ class MeshFacts:
     warnings: tuple[str, ...]
     is_hopeless: bool
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Fields:
         """JSON values; symmetries and warnings are keys of the whole report."""
         return {
             "unit": self.unit,
@@ -90,7 +89,7 @@ class MeshFacts:
         }
 
 
-def _convex_hull(points: NDArray[np.float64]) -> trimesh.Trimesh | None:
+def _convex_hull(points: Floats) -> trimesh.Trimesh | None:
     """The convex hull of points; None of flat ones."""
     try:
         return trimesh.convex.convex_hull(points)
@@ -98,7 +97,7 @@ def _convex_hull(points: NDArray[np.float64]) -> trimesh.Trimesh | None:
         return None
 
 
-def _flat_hull_area(points: NDArray[np.float64]) -> float:
+def _flat_hull_area(points: Floats) -> float:
     """The area of both sides of the convex hull of flat points."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     try:
@@ -163,7 +162,7 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
             f"cover few pixels"
         )
     is_sphere = _is_sphere(mesh)
-    is_large = unit is not None and float(np.linalg.norm(extents)) * METRES.get(unit, 1.0) > ROOM
+    is_large = unit is not None and float(np.linalg.norm(extents)) * UNITS[unit] > ROOM
     is_room = is_large and hull is not None and looks_inwards(mesh, hull)
     is_wire = area_of_hull < WIRE_AREA
     if is_sphere and not is_coloured:
@@ -201,14 +200,14 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
 
 def _size_warnings(size: float, unit: str | None) -> list[str]:
     """What is unusual about the size of the box's diagonal, and which unit would be usual."""
-    sizes = {name: size * METRES[name] for name in ("mm", "cm", "m")}
+    sizes = {name: size * UNITS[name] for name in ("mm", "cm", "m")}
     usual = {name: metres for name, metres in sizes.items() if SMALLEST < metres < LARGEST}
     guess = " or ".join(f"{name} ({metres:.2g} m)" for name, metres in usual.items())
     if unit is None:
         suggested = guess or "none that is usual"
         across = f"{size:.4g} across, which suggests {suggested}"
         return [f"its unit is unknown: {across}; give the unit"]
-    metres = size * METRES.get(unit, 1.0)
+    metres = size * UNITS[unit]
     if SMALLEST < metres < LARGEST:
         return []
     suggested = f"; usual would be {guess}" if guess else ""

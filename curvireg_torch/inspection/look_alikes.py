@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -14,6 +13,7 @@ from ..geometry.conversions import axis_angle_from_rotation, rotation_from_axis_
 from ..geometry.viewpoint import angles_between, up_rotation
 from ..matching import ViewBank, ViewDescriber
 from ..mesh import mesh_up
+from ..utils.aliases import Fields
 
 LOOKED_AT = 48  # Directions from which the mesh is looked at
 RIVAL_ANGLE = 30.0  # Degrees beyond which a look-alike is another answer
@@ -71,20 +71,22 @@ class LookAlike:
         """Whether the mesh's print tells the two views apart."""
         return self.print_differs is not None and self.print_differs > PRINT_FRACTION
 
-    def to_dict(self) -> dict[str, Any]:
-        views = {}
-        for name, rotation in (("view", self.rotation), ("rival", self.rival)):
-            azimuth, elevation, theta = (
-                float(angle) for angle in viewpoint_from_rotation(rotation)
-            )
-            views[name] = {"azimuth": azimuth, "elevation": elevation, "theta": theta}
-        numbers = {
+    def to_dict(self) -> Fields:
+        return {
+            "view": _angles_of(self.rotation),
+            "rival": _angles_of(self.rival),
             "angle_deg": self.angle,
             "similarity": self.similarity,
             "resolved": self.resolved,
+            "alike": self.is_alike,
+            "print_differs": self.print_differs,
+            "hint": self.hint,
         }
-        told = {"alike": self.is_alike, "print_differs": self.print_differs, "hint": self.hint}
-        return {**views, **numbers, **told}
+
+
+def _angles_of(rotation: Tensor) -> dict[str, float]:
+    angles = map(float, viewpoint_from_rotation(rotation))
+    return dict(zip(("azimuth", "elevation", "theta"), angles, strict=True))
 
 
 @torch.no_grad()
@@ -94,7 +96,7 @@ def look_alikes(
     symmetries: Tensor | None,
     *,
     elevations: tuple[float, float] = (-90, 90),
-    report_progress: Callable[[int, int], object] | None = None,
+    report_progress: Callable[[int, int], object] = lambda *_: None,
 ) -> tuple[LookAlike, ...]:
     """The most similar view beyond 30 degrees of each of 48 directions, spread evenly over the
     sphere.
@@ -117,25 +119,21 @@ def look_alikes(
     distance = bank.distances.median().double().cpu()
     descriptors = _described(describer, directions, distance)
     resolved = _resolved(describer, directions, distance, descriptors)
-    group = (
-        torch.eye(3, dtype=torch.float64)[None]
-        if symmetries is None
-        else symmetries[:, :3, :3].double()
-    )
     views = bank.rotations.double().cpu()
     coarse = F.normalize(bank.descriptors, dim=1)
-    matched = _matched(bank, describer, directions, distance)
-    similarity = (F.normalize(matched, dim=1) @ coarse.T).cpu()
+    matched = _described(describer.with_settings(bank.settings), directions, distance)
+    similarity = (matched @ coarse.T).cpu()
     pairs = []
     for row, direction in enumerate(directions):
-        if report_progress is not None:
-            report_progress(row, len(directions))
-        angle = _angle(views, direction, group)
+        report_progress(row, len(directions))
+        angle = _angle(views, direction, symmetries)
         scores = similarity[row].masked_fill(angle <= RIVAL_ANGLE + sum(STEPS), -torch.inf)
         best = scores.topk(min(CANDIDATES, len(scores))).indices
         half_turns = direction @ HALF_TURNS
         candidates = torch.cat([views[best[scores[best].isfinite()]], half_turns])
-        candidates = candidates[_angle(candidates, direction, group) > RIVAL_ANGLE + sum(STEPS)]
+        candidates = candidates[
+            _angle(candidates, direction, symmetries) > RIVAL_ANGLE + sum(STEPS)
+        ]
         if not len(candidates):
             continue
         rival, score = _nearest(describer, candidates, distance, descriptors[row])
@@ -143,15 +141,14 @@ def look_alikes(
             LookAlike(
                 direction,
                 rival,
-                float(_angle(rival[None], direction, group)),
+                float(_angle(rival[None], direction, symmetries)),
                 score,
                 resolved[row],
                 print_difference(describer, direction, rival, distance),
                 _hint(direction, rival, up),
             )
         )
-    if report_progress is not None:
-        report_progress(len(directions), len(directions))
+    report_progress(len(directions), len(directions))
     return tuple(sorted(pairs, key=lambda pair: pair.resolved - pair.similarity))
 
 
@@ -197,23 +194,14 @@ def print_difference(
     return float((difference[seen] > COLOUR_DIFFERENCE).double().mean())
 
 
-def _angle(rotations: Tensor, rotation: Tensor, group: Tensor) -> Tensor:
-    """(N,) degrees between rotations (N, 3, 3) and one (3, 3), up to a group (S, 3, 3)."""
-    return angles_between(rotations, rotation[None], group)[:, 0]
+def _angle(rotations: Tensor, rotation: Tensor, symmetries: Tensor | None) -> Tensor:
+    """(N,) degrees between rotations (N, 3, 3) and one (3, 3), up to symmetries (S, 4, 4)."""
+    return angles_between(rotations, rotation[None], symmetries)[:, 0]
 
 
 def _described(describer: ViewDescriber, rotations: Tensor, distance: Tensor) -> Tensor:
     """(N, D) descriptors of unit length."""
     return F.normalize(describer.descriptors(rotations, distance.expand(len(rotations))), dim=1)
-
-
-def _matched(
-    bank: ViewBank, describer: ViewDescriber, rotations: Tensor, distance: Tensor
-) -> Tensor:
-    """(N, D) descriptors as the bank has them."""
-    return describer.with_settings(bank.settings).descriptors(
-        rotations, distance.expand(len(rotations))
-    )
 
 
 def _turns(degrees: float) -> Tensor:

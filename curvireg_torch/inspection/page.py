@@ -1,6 +1,5 @@
 """The report of a mesh as one HTML page with pictures, and as lines of text."""
 
-import base64
 import html
 from collections import defaultdict
 from collections.abc import Sequence
@@ -11,8 +10,8 @@ from torch import Tensor
 
 from ..matching import ViewDescriber
 from ..registration import Registrar
-from ..visualization.contours import close_up, draw_window
-from ..visualization.encoding import jpeg, to_uint8
+from ..visualization.contours import close_up, draw_window, longer_side
+from ..visualization.encoding import embedded, jpeg, to_uint8
 from .facts import CONTINUOUS_TURN, MeshFacts
 from .look_alikes import LookAlike
 from .report import ELEVATIONS, PIXELS_ACROSS, Inspection
@@ -137,9 +136,8 @@ def _symmetry_table(facts: MeshFacts) -> str:
 
 def _pairs(report: Inspection, registrar: Registrar | None) -> str:
     count = (
-        f"From {len(report.alike)} of {len(report.pairs)} directions another side looks "
-        f"alike: "
-        f"their edges differ by"
+        f"From {len(report.alike)} of {len(report.pairs)} directions another side looks alike: "
+        "their edges differ by"
     )
     told = f" The print tells {report.told_by_print} of them apart."
     lines = [
@@ -175,7 +173,7 @@ def _picture(shaded: Tensor) -> bytes:
 
 
 def _image(content: bytes) -> str:
-    return f'<img alt="" src="data:image/jpeg;base64,{base64.b64encode(content).decode()}">'
+    return f'<img alt="" src="{embedded(content)}">'
 
 
 def _expectation(report: Inspection) -> str:
@@ -222,7 +220,7 @@ def _confusion_figure(outcome: Outcome, registrar: Registrar) -> str:
     assert outcome.result is not None
     image = outcome.photograph.image
     window = close_up(image.shape[-2:], outcome.photograph.box.tolist())
-    scale = PICTURE_SIDE / max(window[2] - window[0], window[3] - window[1])
+    scale = PICTURE_SIDE / longer_side(window)
     drawn = draw_window(registrar.describer, outcome.result.projection, image, window, scale)
     confidence = outcome.result.confidence
     said = "" if confidence is None else f", confidence {int(100 * confidence) / 100:.2f}"

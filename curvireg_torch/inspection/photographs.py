@@ -94,20 +94,20 @@ class PhotographGenerator:
 
     def __call__(self, index: int) -> GeneratedPhotograph:
         """Photograph number ``index``."""
-        K = trial_camera()
         mesh = photographed_mesh(self.mesh)
         generator = torch.Generator().manual_seed(1_000_003 * self.seed + index)
         # of its own: clutter changes nothing else
         others = torch.Generator().manual_seed(1_000_033 * self.seed + index)
-        truth = _random_truth(mesh, K, generator, upright=self.upright)
+        truth = _random_truth(mesh, generator, upright=self.upright)
         background = procedural_background(SIZE, generator)
         if self.backgrounds:
             background = self.backgrounds[index % len(self.backgrounds)]
         if self.clutter:
-            background = _with_objects_behind(background, mesh, truth, K, others)
+            background = _with_objects_behind(background, mesh, truth, others)
+        K = trial_camera()
         image, box = synthesize_photograph(mesh, truth, K, SIZE, generator, background=background)
         if self.clutter and float(torch.rand((), generator=others)) < 0.5:
-            image = _with_object_in_front(image, box, mesh, truth, K, others)
+            image = _with_object_in_front(image, box, mesh, truth, others)
         blur = BLUR * float(torch.rand((), generator=generator))
         if blur > SHARP:
             image = gaussian_smooth(image[None], blur)[0]
@@ -179,12 +179,10 @@ def to_bytes(image: Tensor) -> Tensor:
     return (255.0 * image).round().to(torch.uint8)
 
 
-def _random_truth(
-    mesh: trimesh.Trimesh, K: Tensor, generator: torch.Generator, *, upright: bool
-) -> Tensor:
+def _random_truth(mesh: trimesh.Trimesh, generator: torch.Generator, *, upright: bool) -> Tensor:
     """A (4, 4) pose that shows the mesh; seen from everywhere and rolled, unless it is upright."""
     elevations = UPRIGHT if upright else (-90.0, 90.0)
-    T = random_pose(mesh, K, SIZE, generator, elevations=elevations, fill=FILL)
+    T = random_pose(mesh, trial_camera(), SIZE, generator, elevations=elevations, fill=FILL)
     centre = mesh_centre(mesh)
     position = point_in_cameras(T, centre)
     R = T[:3, :3]
@@ -206,9 +204,8 @@ def _wrong_box(box: Tensor, generator: torch.Generator) -> Tensor:
     sides = (box[2:] - box[:2]).repeat(2)
     moved = box + BOX_ERROR * sides * torch.randn(4, generator=generator)
     height, width = SIZE
-    low = torch.tensor([-0.5, -0.5, -0.5, -0.5])
     high = torch.tensor([width - 0.5, height - 0.5, width - 0.5, height - 0.5])
-    return torch.minimum(torch.maximum(moved, low), high)
+    return torch.minimum(moved.clamp(min=-0.5), high)
 
 
 def _random_object(radius: float, generator: torch.Generator) -> trimesh.Trimesh:
@@ -229,11 +226,7 @@ def _random_object(radius: float, generator: torch.Generator) -> trimesh.Trimesh
 
 
 def _with_objects_behind(
-    background: Tensor,
-    mesh: trimesh.Trimesh,
-    truth: Tensor,
-    K: Tensor,
-    generator: torch.Generator,
+    background: Tensor, mesh: trimesh.Trimesh, truth: Tensor, generator: torch.Generator
 ) -> Tensor:
     """The background with up to six objects beside and behind the object, as far away as its
     centre or farther."""
@@ -247,17 +240,12 @@ def _with_objects_behind(
         aside = torch.stack([(2.0 * torch.pi * angle).cos(), (2.0 * torch.pi * angle).sin()])
         place = centre + torch.cat([away * aside, (2.0 * radius * deep)[None]])
         other = _random_object(radius * float(SIZES[0] + (SIZES[1] - SIZES[0]) * size), generator)
-        picture = _with_object(picture, other, place, K, generator)
+        picture = _with_object(picture, other, place, generator)
     return picture
 
 
 def _with_object_in_front(
-    image: Tensor,
-    box: Tensor,
-    mesh: trimesh.Trimesh,
-    truth: Tensor,
-    K: Tensor,
-    generator: torch.Generator,
+    image: Tensor, box: Tensor, mesh: trimesh.Trimesh, truth: Tensor, generator: torch.Generator
 ) -> Tensor:
     """The photograph with something before a side or corner of the object's box, of which it covers
     less than a third."""
@@ -270,19 +258,16 @@ def _with_object_in_front(
     across = float(sides.min()) * COVERED**0.5
     angle = 2.0 * torch.pi * torch.rand((), generator=generator, dtype=torch.float64)
     at = 0.5 * (box[:2] + box[2:]).double() + 0.5 * sides * torch.stack([angle.cos(), angle.sin()])
-    ray = torch.linalg.inv(K) @ torch.cat([at, torch.ones(1, dtype=torch.float64)])
+    ray = torch.linalg.inv(trial_camera()) @ torch.cat([at, torch.ones(1, dtype=torch.float64)])
     other = _random_object(across * depth / FOCAL, generator)
-    return _with_object(image, other, depth * ray, K, generator)
+    return _with_object(image, other, depth * ray, generator)
 
 
 def _with_object(
-    picture: Tensor,
-    mesh: trimesh.Trimesh,
-    place: Tensor,
-    K: Tensor,
-    generator: torch.Generator,
+    picture: Tensor, mesh: trimesh.Trimesh, place: Tensor, generator: torch.Generator
 ) -> Tensor:
     """The picture with an object around a point (3,) in front of it, if the camera sees it."""
+    K = trial_camera()
     pixel = (K @ place)[:2] / place[2]
     height, width = SIZE
     if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):

@@ -17,6 +17,7 @@ from ..mesh import has_colours
 from ..mesh.mesh import as_mesh
 from ..pipeline import Pipeline
 from ..registration import Registrar
+from ..utils.aliases import Fields
 from ..utils.checks import check_integer
 from ..utils.likes import MeshLike
 from ..utils.threads import one_torch_thread
@@ -119,9 +120,9 @@ class Inspection:
         """Whether this mesh cannot work."""
         return self.facts.is_hopeless
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Fields:
         """The content of ``inspect.json``; its keys are described in docs/guides/inspect.md."""
-        document: dict[str, Any] = {
+        document: Fields = {
             "schema": 1,
             "mesh": self.facts.to_dict(),
             "symmetries": [symmetry.to_dict() for symmetry in self.facts.symmetries],
@@ -219,12 +220,12 @@ def inspect(
         pictures = [_background(picture) for picture in backgrounds]
         upright = registrar.pipeline.views.pose == "upright"
         generate = PhotographGenerator(clean, seed, upright, pictures, clutter)
-        how: dict[str, Any] = {"with_camera": with_camera, "compare": compare, "report": report}
+        how: Fields = {"with_camera": with_camera, "compare": compare, "report": report}
         return replace(found, trial=run_trial(registrar, generate, n, **how))
 
 
 def look_alikes_of(
-    registrar: Registrar, report_progress: Callable[[int, int], object] | None = None
+    registrar: Registrar, report_progress: Callable[[int, int], object] = lambda *_: None
 ) -> tuple[LookAlike, ...]:
     """:func:`.look_alikes` of a registrar's mesh, from where its views are looked at."""
     mesh = registrar.bank.mesh

@@ -2,12 +2,10 @@
 inwards."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -16,6 +14,7 @@ from ..mesh import has_colours, mesh_symmetries
 from ..mesh.colours import VARIED_BY, VARIED_FRACTION, colours_at, surface_colours
 from ..mesh.mesh import mesh_radius
 from ..rendering.embree import RayScene
+from ..utils.aliases import Fields, Floats, Integers
 
 POINTS = 2_000  # of the surface, of which samples consist
 DENSER = 20  # Times so many points that others are compared with
@@ -51,7 +50,7 @@ class Symmetry:
     deviation_percent: float
     has_same_colours: bool
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Fields:
         return {
             "transform": self.transform.tolist(),
             "angle_deg": self.angle,
@@ -117,14 +116,14 @@ class _ColouredPoints:
             is_same = is_same and self._differing(self._moved(transform)[1]) <= most
         return 100.0 * deviation / self.diameter, is_same
 
-    def _moved(self, transform: Tensor) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def _moved(self, transform: Tensor) -> tuple[Floats, Integers]:
         """Distances from the surface of some points that are moved, and the points nearest to
         them."""
         moved = self.some @ transform[:3, :3].numpy().T + transform[:3, 3].numpy()
         distance, nearest = self.tree.query(moved)
         return distance, nearest
 
-    def _differing(self, nearest: NDArray[np.int64]) -> float:
+    def _differing(self, nearest: Integers) -> float:
         """Fraction of some points whose colours differ from those of others."""
         if self.colours is None:
             return 0.0
@@ -132,7 +131,7 @@ class _ColouredPoints:
         return float((difference > VARIED_BY / 255.0).mean())
 
 
-def thin_fraction(mesh: trimesh.Trimesh, part: NDArray[np.int64]) -> float:
+def thin_fraction(mesh: trimesh.Trimesh, part: Integers) -> float:
     """Fraction of the surface behind which its own part, a number for each face (F,), is thinner
     than 1 % of the mesh's diameter.
 

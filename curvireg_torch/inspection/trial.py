@@ -23,6 +23,7 @@ from ..matching import cached_bank
 from ..mesh import has_colours, mesh_centre, mesh_up
 from ..registration import Registrar, Registration
 from ..synthetic import synthesize_photograph
+from ..utils.aliases import Fields
 from ..utils.threads import map_on_threads
 from .photographs import (
     SIZE,
@@ -104,7 +105,7 @@ class Expected:
         interval = counted.proportion_ci(method="wilson")
         return float(interval.low), float(interval.high)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Fields:
         return {**vars(self), "right_interval": list(self.right_interval)}
 
 

@@ -191,8 +191,7 @@ def check_pose(T: Tensor, name: str) -> None:
     if bad:
         raise InvalidInputError(
             f"{name}: expected rigid transforms [[R, t], [0, 0, 0, 1]], R orthonormal with "
-            f"determinant +1, "
-            f"got {bad} that are not; remove scale and reflection"
+            f"determinant +1, got {bad} that are not; remove scale and reflection"
         )
 
 
@@ -247,10 +246,7 @@ def check_square_pixels(K: Tensor, name: str = "camera matrix") -> None:
     """The focal lengths of valid (..., 3, 3) cameras are at most 10 % apart: views are rendered
     with square pixels."""
     for camera in K.reshape(-1, 3, 3).tolist():
-        fx = camera[0][0]
-        fy = camera[1][1]
-        cx = camera[0][2]
-        cy = camera[1][2]
+        (fx, _, cx), (_, fy, cy), _ = camera
         if not are_nearly_equal(fx, fy):
             advice = "resize the image's width by FY / FX, and FX, CX and the box with it"
             if are_nearly_equal(cx, cy):

@@ -1,10 +1,11 @@
 """Objects without what follows from the rest of them."""
 
 from functools import cached_property
-from typing import Any
+
+from .aliases import Fields
 
 
-def without_computed(thing: object) -> dict[str, Any]:
+def without_computed(thing: object) -> Fields:
     """The attributes of an object but for those that its cached properties have computed.
 
     Example:

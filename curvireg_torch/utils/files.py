@@ -22,6 +22,7 @@ from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MAX_TABLE_BYTES, InvalidInputError, MissingFileError, OutputError
+from .aliases import PathName
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -64,10 +65,13 @@ def write_file(path: Path, content: bytes) -> None:
 def write_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
     """:func:`write_file` of rows of comma-separated cells; an apostrophe precedes what a
     spreadsheet would compute."""
+    write_file(path, _csv(rows))
+
+
+def _csv(rows: Iterable[Sequence[object]]) -> bytes:
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n").writerows(map(_inert, row) for row in rows)
-    # file names may be no UTF-8
-    write_file(path, text.getvalue().encode(errors="backslashreplace"))
+    return text.getvalue().encode(errors="backslashreplace")  # file names may be no UTF-8
 
 
 class CsvFile:
@@ -86,16 +90,10 @@ class CsvFile:
 
     def add(self, row: Sequence[object]) -> None:
         """Write one row."""
-        text = io.StringIO(newline="")
-        writer = csv.writer(text, lineterminator="\n")
-        mode = "ab"
-        if self._header is not None:
-            writer.writerow(self._header)
-            mode = "wb"
-        writer.writerow(list(map(_inert, row)))
+        content = _csv([row] if self._header is None else [self._header, row])
         try:
-            with self.path.open(mode) as file:
-                file.write(text.getvalue().encode(errors="backslashreplace"))
+            with self.path.open("ab" if self._header is None else "wb") as file:
+                file.write(content)
         except OSError as error:
             raise OutputError(
                 f"cannot be written ({error.strerror}); make room", subject=self.path
@@ -233,7 +231,7 @@ def read_json(path: Path, kind: type[Any] | tuple[type[Any], ...], readme: str) 
     return content
 
 
-def split_name(path: str | os.PathLike[str]) -> tuple[Path, str]:
+def split_name(path: PathName) -> tuple[Path, str]:
     """The file and the name of ``FILE:NAME``; a file or folder that exists has no name."""
     file = Path(path)
     text = str(path)

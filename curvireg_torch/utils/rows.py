@@ -2,11 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from .aliases import Fields
+
+Part = TypeVar("Part", bound="Rows")
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Rows:
         [1.0, 2.0, 3.0, 1.0]
     """
 
-    def columns(self) -> dict[str, Any]:
+    def columns(self) -> Fields:
         """The fields that have a row for each thing, by name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: x for name, x in values.items() if isinstance(x, Tensor | np.ndarray | Rows)}
@@ -43,28 +47,24 @@ class Rows:
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:
         """The rows of all parts, of which there must be one; it has what is no column."""
-        rows: Self = _combined(parts, _cat)
-        return rows
+        return _combined(parts, _cat)
 
     @classmethod
     def cat_within(cls, parts: Sequence[Self]) -> Self:
         """The same rows, each with what all parts have in it: along the second dimension."""
-        rows: Self = _combined(parts, lambda columns: torch.cat(columns, dim=1))
-        return rows
+        return _combined(parts, lambda columns: torch.cat(columns, dim=1))
 
     @classmethod
     def stack(cls, parts: Sequence[Self]) -> Self:
         """Parts of equal shapes along a new first dimension."""
-        rows: Self = _combined(parts, torch.stack)
-        return rows
+        return _combined(parts, torch.stack)
 
     def replaced(self, index: Tensor, others: Self) -> Self:
         """These rows with ``others`` in the places ``index`` (M,)."""
-        rows: Self = _combined([self, others], lambda columns: _replaced(index, *columns))
-        return rows
+        return _combined([self, others], lambda columns: _replaced(index, *columns))
 
 
-def _combined(parts: Sequence[Any], combine: Callable[[list[Any]], Any]) -> Any:
+def _combined(parts: Sequence[Part], combine: Callable[[list[Any]], Any]) -> Part:
     """The first part with each column combined with the others'."""
     first = parts[0]
     columns = [part.columns() for part in parts]

@@ -1,9 +1,10 @@
 """Colours as pictures store them (sRGB) and as light adds up (linear)."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Colours = NDArray[np.float64]
+from .aliases import Floats
+
+Colours = Floats
 
 
 def srgb(linear: Colours) -> Colours:

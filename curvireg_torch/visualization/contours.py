@@ -57,6 +57,12 @@ def close_up(size: Sequence[int], box: Sequence[float]) -> tuple[int, int, int, 
     return left, top, min(W, left + side), min(H, top + side)
 
 
+def longer_side(window: Sequence[float]) -> float:
+    """The longer side of a window or box x0, y0, x1, y1."""
+    x0, y0, x1, y1 = window
+    return max(x1 - x0, y1 - y0)
+
+
 def draw_window(
     describer: ViewDescriber,
     projection: tuple[Tensor, Tensor] | None,

@@ -1,5 +1,7 @@
 """Pictures as arrays and as files in memory."""
 
+import base64
+
 import cv2
 import numpy as np
 from torch import Tensor
@@ -16,6 +18,11 @@ def jpeg(picture: np.ndarray, quality: int) -> bytes:
     return bytes(
         cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
     )
+
+
+def embedded(content: bytes) -> str:
+    """A JPEG file as the address of a picture in a page."""
+    return f"data:image/jpeg;base64,{base64.b64encode(content).decode()}"
 
 
 def shrink(picture: np.ndarray, side: int) -> np.ndarray:

@@ -17,9 +17,10 @@ from ..registration import Hypothesis, Registrar, Registration
 from ..registration.confidence import two_decimals
 from ..registration.photograph import Photograph, as_photograph
 from ..terms import crop_photographs, photograph_field
+from ..utils.aliases import Size
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, ImageLike
-from .contours import Drawn, close_up, draw_window
+from .contours import Drawn, close_up, draw_window, longer_side
 from .encoding import to_uint8
 from .words import pose_in_words
 
@@ -120,12 +121,8 @@ def views_sheet(
     tiles = []
     for projection, image, box, caption in views:
         H, W = image.shape[-2:]
-        tiles.append(
-            (
-                caption,
-                draw_window(describer, projection, image, (0, 0, W, H), side / max(H, W), box),
-            )
-        )
+        picture = draw_window(describer, projection, image, (0, 0, W, H), side / max(H, W), box)
+        tiles.append((caption, picture))
     height = max(picture.shape[0] for _, picture in tiles)
     sheet = Image.new("RGB", (MOST, -(-len(views) // columns) * (height + 32 + GAP)), PAPER)
     _paste_tiles(sheet, tiles, (0, 0), columns, (side, height), 16)
@@ -135,9 +132,9 @@ def views_sheet(
 def _paste_tiles(
     sheet: Image.Image,
     tiles: Sequence[tuple[str, np.ndarray]],
-    corner: tuple[int, int],
+    corner: Size,
     columns: int,
-    size: tuple[int, int],
+    size: Size,
     line: int,
 ) -> None:
     """Paste pictures into a grid of cells of ``size`` (W, H), each with its caption below, ``line``
@@ -268,7 +265,7 @@ def _draw_caption(
     draw: ImageDraw.ImageDraw,
     registrar: Registrar,
     result: Registration,
-    corner: tuple[int, int],
+    corner: Size,
     size: int,
     note: str,
 ) -> None:
@@ -300,7 +297,7 @@ def _small_pictures(
 ) -> list[tuple[str, np.ndarray]]:
     """Captions and pictures, at most ``side`` px wide and high."""
     window = close_up(item.size, item.box.tolist())
-    scale = side / max(window[2] - window[0], window[3] - window[1])
+    scale = side / longer_side(window)
     describer = registrar.describer
     close_ups = [
         draw_window(describer, h.projection, item.image, window, scale) for h in result.hypotheses
@@ -314,10 +311,6 @@ def _small_pictures(
 
 
 def _rival(result: Registration, index: int) -> str:
-    angle = (
-        f"rival: {float(rotation_error(result.hypotheses[index].rotation, result.rotation)):.0f}° "
-        f"away"
-    )
-    return (
-        f"{angle} ({two_decimals(result.probabilities[index])})" if result.probabilities else angle
-    )
+    angle = float(rotation_error(result.hypotheses[index].rotation, result.rotation))
+    text = f"rival: {angle:.0f}° away"
+    return f"{text} ({two_decimals(result.probabilities[index])})" if result.probabilities else text

@@ -1,9 +1,8 @@
 """The mesh at its pose, the camera and the photograph behind it, as one glTF binary file."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import BytesIO
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..mesh.colours import colours_at, surface_colours
 from ..mesh.mesh import mesh_centre, mesh_radius, mesh_unit
+from ..utils.aliases import Fields
 from ..utils.checks import check_camera_matrix, check_photograph, check_pose, check_tensor
 from ..utils.choices import UNITS
 from ..utils.srgb import linear_colours
@@ -63,9 +63,7 @@ def mesh_glb(mesh: trimesh.Trimesh, transform: Tensor) -> bytes:
     """A GLB file of the mesh alone, moved by a (4, 4) transform to glTF's axes and metres."""
     scene = trimesh.Scene()
     scene.add_geometry(_coloured(mesh), transform=transform.numpy())
-    return bytes(
-        trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=_make_matt)
-    )
+    return _exported(scene, _make_matt)
 
 
 def scene_glb(
@@ -113,7 +111,7 @@ def scene_glb(
             {"name": name, "camera": number, "matrix": place.T.flatten().tolist(), "extras": exact}
         )
 
-    def with_cameras(tree: dict[str, Any]) -> None:
+    def with_cameras(tree: Fields) -> None:
         tree["cameras"] = lenses
         tree["scenes"][0]["nodes"] += range(len(tree["nodes"]), len(tree["nodes"]) + len(nodes))
         tree["nodes"] += nodes
@@ -123,14 +121,16 @@ def scene_glb(
                 material["extensions"] = {"KHR_materials_unlit": {}}
                 tree["extensionsUsed"] = ["KHR_materials_unlit"]
 
-    return bytes(
-        trimesh.exchange.gltf.export_glb(
-            scene, include_normals=True, tree_postprocessor=with_cameras
-        )
-    )
+    return _exported(scene, with_cameras)
 
 
-def _make_matt(tree: dict[str, Any]) -> None:
+def _exported(scene: trimesh.Scene, change: Callable[[Fields], None]) -> bytes:
+    """A GLB file of a scene whose tree is changed before it is written."""
+    export = trimesh.exchange.gltf.export_glb
+    return bytes(export(scene, include_normals=True, tree_postprocessor=change))
+
+
+def _make_matt(tree: Fields) -> None:
     """Give a matt material to the parts of a glTF file that have none."""
     tree.setdefault("materials", []).append(_MATT)
     for mesh in tree["meshes"]:
@@ -147,11 +147,9 @@ def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     if colours is not None:
         index = np.arange(len(faces), dtype=np.int32)
         zero = np.zeros(len(faces), np.float32)
-        corners = [
-            colours_at(colours, index, u, v)
-            for u, v in ((zero, zero), (zero + 1, zero), (zero, zero + 1))
-        ]
-        rgb = np.stack(corners, axis=1)
+        one = zero + 1
+        corners = (zero, zero), (one, zero), (zero, one)
+        rgb = np.stack([colours_at(colours, index, u, v) for u, v in corners], axis=1)
     # From sRGB: the vertex colours of glTF are linear.
     linear = linear_colours(rgb)
     rgba = np.full((*faces.shape, 4), 255, np.uint8)

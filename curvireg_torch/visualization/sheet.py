@@ -1,7 +1,6 @@
 """One HTML page of results: thumbnails with the contours at the estimated poses, best or worst
 first."""
 
-import base64
 import html
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,8 +11,8 @@ from torch import Tensor
 
 from ..matching import ViewDescriber
 from ..utils.files import write_file
-from .contours import Drawn, close_up, draw_window
-from .encoding import jpeg
+from .contours import Drawn, close_up, draw_window, longer_side
+from .encoding import embedded, jpeg
 
 SIDE = 224  # longer side of a thumbnail in px
 MAX_ENTRIES = 500  # of the best, and of the worst: a larger page would be slow to open
@@ -67,7 +66,7 @@ def thumbnail(
     boxes = np.array([box, *(copy.box for copy in copies)])
     around = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]
     window = close_up(image.shape[-2:], around)
-    scale = min(1.0, SIDE / max(window[2] - window[0], window[3] - window[1]))
+    scale = min(1.0, SIDE / longer_side(window))
     return jpeg(draw_window(describer, projection, image, window, scale, box, copies), 80)
 
 
@@ -93,8 +92,8 @@ def _figure(entry: SheetEntry) -> str:
     name = html.escape(entry.name)
     picture = ""
     if entry.picture is not None and entry.picture.is_file():
-        data = base64.b64encode(entry.picture.read_bytes()).decode()
-        picture = f'<img alt="contours over {name}" src="data:image/jpeg;base64,{data}">'
+        data = embedded(entry.picture.read_bytes())
+        picture = f'<img alt="contours over {name}" src="{data}">'
     caption = f"<b>{entry.number}</b> {name}<br>{html.escape(entry.caption)}"
     kind = entry.kind.replace(" ", "-")
     return f'<figure class="{kind}">{picture}<figcaption>{caption}</figcaption></figure>'

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from torch import Tensor
 
 from ..fitting.exactness import degrees_in_words
 from ..geometry.pose_prior import object_frame
 from ..geometry.viewpoint import viewpoint_from_rotation
+from ..utils.aliases import Document
 from ..utils.choices import SIDE_NAMES
 
 # How sure an answer is, surest first; the last two have no pose
@@ -25,7 +25,7 @@ def corners(box: Sequence[float]) -> str:
     return " ".join(f"{v:.0f}" for v in box)
 
 
-def remarks(document: Mapping[str, Any]) -> list[str]:
+def remarks(document: Document) -> list[str]:
     """Lines about numbers that did not fit, a replaced box or contradicted limits, and about a
     symmetric mesh."""
     box = document["corrected_box"]
@@ -44,7 +44,7 @@ def remarks(document: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _exactness_in_words(exactness: Mapping[str, Any], camera_source: str | None) -> str:
+def _exactness_in_words(exactness: Document, camera_source: str | None) -> str:
     """How exact a pose is; of an estimated camera, how exact the rotation is that a cropped
     photograph does not change."""
     if camera_source != "estimated":
@@ -56,7 +56,7 @@ def _exactness_in_words(exactness: Mapping[str, Any], camera_source: str | None)
     )
 
 
-def camera_in_words(document: Mapping[str, Any]) -> list[str]:
+def camera_in_words(document: Document) -> list[str]:
     """A line about a camera that was not given exactly: where it is from, and how well its focal
     length is known."""
     camera = document["camera"]
@@ -64,7 +64,7 @@ def camera_in_words(document: Mapping[str, Any]) -> list[str]:
     return [line] if line else []
 
 
-def used_camera_in_words(document: Mapping[str, Any]) -> str:
+def used_camera_in_words(document: Document) -> str:
     """The camera with which a pose was found; where its focal length is not known exactly, how far
     away the object is, how certain that is, and why.
 
@@ -111,9 +111,7 @@ def measured(translation: Sequence[float], deviation: float = 0.0) -> list[str]:
     return [f"{round(v, decimals) + 0.0:.{max(decimals, 0)}f}" for v in translation]
 
 
-def focal_length_in_words(
-    camera: Mapping[str, Any], picture: Mapping[str, Any] | None = None
-) -> str:
+def focal_length_in_words(camera: Document, picture: Document | None = None) -> str:
     """Where a camera, as :meth:`.Camera.describe` has it, is from, and how well its focal length is
     known; "" if it was given exactly. ``picture`` has the ``focal_35mm`` of the EXIF data."""
     if not camera["focal_deviation"]:
@@ -134,7 +132,7 @@ def focal_length_in_words(
     return f"camera: focal length estimated, {known}{weak}"
 
 
-def view_in_words(view: Mapping[str, Any]) -> str:
+def view_in_words(view: Document) -> str:
     """Why a photograph of several, one of a document's ``photographs``, does not count, or how
     much it does; empty if its pose was set by hand, so that nobody has compared it."""
     counts = "" if view["similarity"] is None else f"prefers the pose by {view['contribution']:.2f}"

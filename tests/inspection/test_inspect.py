@@ -106,6 +106,7 @@ def test_open_doubled_and_loose_faces_are_counted():
         (0.3, "mm", "really mm; usual would be m (0.4 m)?"),
         (1000.0, "m", "1,319 m across"),
         (0.3, "m", None),
+        (80.0, "dm", None),
     ],
 )
 def test_unit_is_doubted_by_size(size, unit, text):

@@ -1,13 +1,14 @@
 """The boxes that a file lists, as they are written there."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 from ...errors import InvalidInputError
+from ...utils.aliases import Document, Size
 from ...utils.files import check_table_size, finite_numbers, read_json
 from ..xml_files import read_xml
 
@@ -45,7 +46,7 @@ class ImageBox:
     corners: Corners
     is_relative: bool = False
     image: str = ""
-    size: tuple[int, int] | None = None
+    size: Size | None = None
     score: float = 1.0
     labels: frozenset[str] = frozenset()
     track: str = ""
@@ -150,7 +151,7 @@ def _json(content: Any) -> Iterator[ImageBox]:
     raise _refused("expected detections of COCO, or annotations of LabelMe")
 
 
-def _labelme(content: Mapping[str, Any]) -> Iterator[ImageBox]:
+def _labelme(content: Document) -> Iterator[ImageBox]:
     """Shapes of points in px from the picture's edge; a circle is its centre and a point on it."""
     size = _size(content.get("imageHeight"), content.get("imageWidth"))
     image = str(content.get("imagePath") or "")
@@ -175,7 +176,7 @@ def _numbers_of_points(points: Any) -> Sequence[float]:
     return () if None in pairs else [number for pair in pairs for number in pair or ()]
 
 
-def _coco(content: Mapping[str, Any]) -> Iterator[ImageBox]:
+def _coco(content: Document) -> Iterator[ImageBox]:
     """Of COCO x, y, width, height from the picture's edge; of MegaPose ``bbox_modal``, corners from
     the centre of the first pixel."""
     images = _by_id(content.get("images"))
@@ -203,13 +204,13 @@ def _coco(content: Mapping[str, Any]) -> Iterator[ImageBox]:
         yield ImageBox(corners, image=file_name, size=size, score=score[0], labels=labels)
 
 
-def _by_id(entries: Any) -> dict[str, Mapping[str, Any]]:
+def _by_id(entries: Any) -> dict[str, Document]:
     """The dicts of a list by their ``id``."""
     known = entries if isinstance(entries, list) else []
     return {str(entry.get("id")): entry for entry in known if isinstance(entry, dict)}
 
 
-def _size(height: Any, width: Any) -> tuple[int, int] | None:
+def _size(height: Any, width: Any) -> Size | None:
     """(H, W) where both are whole numbers > 0."""
     sides = finite_numbers([height, width], 2)
     if sides is None or min(sides) < 1 or any(side != int(side) for side in sides):

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from ...errors import CurviregWarning, InvalidInputError, MissingFileError
+from ...utils.aliases import PathName, Size
 from ...utils.choices import BOX_FORMATS
 from ...utils.files import split_name, without_zeros
 from .files import (
@@ -28,18 +29,16 @@ MAX_FOLDERS = 8  # around a photograph by which it is told from others of its na
 class PictureSize(NamedTuple):
     """(H, W) of a photograph as viewers show it, and its EXIF orientation, 1 to 8."""
 
-    shown: tuple[int, int]
+    shown: Size
     orientation: int = 1
 
     @property
-    def stored(self) -> tuple[int, int]:
+    def stored(self) -> Size:
         """(H, W) of the pixels in the file."""
         return self.shown[::-1] if self.orientation > 4 else self.shown
 
 
-def pixel_box(
-    numbers: Sequence[float], box_format: str, size: tuple[int, int] | None = None
-) -> Corners:
+def pixel_box(numbers: Sequence[float], box_format: str, size: Size | None = None) -> Corners:
     """x0, y0, x1, y1 in px of the four numbers of a box.
 
     Args:
@@ -64,7 +63,7 @@ def pixel_box(
     return _of_fractions((a, b, c, d), size)
 
 
-def _of_fractions(corners: Corners, size: tuple[int, int]) -> Corners:
+def _of_fractions(corners: Corners, size: Size) -> Corners:
     if not all(-0.5 <= value <= 1.5 for value in corners):
         kinds = ", ".join(BOX_FORMATS)
         raise InvalidInputError(
@@ -105,7 +104,7 @@ class BoxFile:
         (9.5, 19.5, 39.5, 59.5)
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: PathName) -> None:
         self.path, self.label = split_name(path)
         # the photograph that was given boxes which name no folder: another of its name is refused
         self._owners: dict[str, str] = {}
@@ -135,7 +134,7 @@ class BoxFile:
             )
         return found
 
-    def of_frame(self, name: str, size: tuple[int, int]) -> Corners | None:
+    def of_frame(self, name: str, size: Size) -> Corners | None:
         """:meth:`box` of a frame of a video of (H, W), called as its picture would be; None if it
         has none."""
         return self._find(Path(name), lambda: PictureSize(size), owner="")
@@ -300,7 +299,7 @@ def _in_pixels(box: ImageBox, picture: Callable[[], PictureSize]) -> Corners:
     return _from_centre(_fitted(box.corners, box.size, picture()))
 
 
-def _fitted(corners: Corners, size: tuple[int, int], picture: PictureSize) -> Corners:
+def _fitted(corners: Corners, size: Size, picture: PictureSize) -> Corners:
     """The corners in a photograph of those in a picture of another size, or that was not turned as
     its EXIF data say."""
     if not _has_proportions(size, picture.shown):
@@ -319,13 +318,13 @@ def _fitted(corners: Corners, size: tuple[int, int], picture: PictureSize) -> Co
     return x0 * x, y0 * y, x1 * x, y1 * y
 
 
-def _has_proportions(size: tuple[int, int], other: tuple[int, int]) -> bool:
+def _has_proportions(size: Size, other: Size) -> bool:
     """Whether two pictures differ in scale alone; sides are rounded."""
     (h, w), (H, W) = size, other
     return abs(w * H / h - W) <= 1 or abs(h * W / w - H) <= 1
 
 
-def _turned(corners: Corners, size: tuple[int, int], orientation: int) -> Corners:
+def _turned(corners: Corners, size: Size, orientation: int) -> Corners:
     """Corners in the stored picture of (H, W) as they are where its EXIF orientation, above 4, is
     applied."""
     height, width = size

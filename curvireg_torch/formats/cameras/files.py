@@ -3,12 +3,13 @@
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ...errors import MAX_CAMERA_BYTES, InvalidInputError, MissingFileError
+from ...utils.aliases import Document, Fields, PathName
 from ...utils.files import split_name, without_zeros
 from ..documents import EXPECTED, read_document
 from .kinds import FORMATS, Format
@@ -33,7 +34,7 @@ _ITEM_NAMES = ("name", "id", "file_path")  # of a camera in a list
 _PAIR = {"l": "left", "r": "right"}
 
 
-def read_camera(path: str | os.PathLike[str]) -> CameraRecord:
+def read_camera(path: PathName) -> CameraRecord:
     """The camera of a calibration file; of one with several, ``FILE:NAME`` names one.
 
     Read are YAML, XML and JSON of OpenCV, also stereo (``M1``, ``D1``: ``FILE:1``), and ``.npz``
@@ -72,7 +73,7 @@ class CameraFiles:
     def __init__(self) -> None:
         self._files: dict[Path, _Cameras] = {}
 
-    def read(self, path: str | os.PathLike[str]) -> CameraRecord:
+    def read(self, path: PathName) -> CameraRecord:
         """:func:`read_camera`."""
         file, name = split_name(path)
         if not os.path.isfile(file):
@@ -103,8 +104,8 @@ class _Found:
     format."""
 
     path: tuple[str, ...]
-    values: Mapping[str, Any]
-    around: tuple[Mapping[str, Any], ...]
+    values: Document
+    around: tuple[Document, ...]
     format: Format
 
     @property
@@ -142,8 +143,7 @@ class _Cameras:
             keys = ", ".join(repr(key) for key in list(dict.fromkeys(unread))[:4])
             raise InvalidInputError(
                 f"{keys}: looks like distortion, but is not read; write the coefficients as "
-                f"distortion_coefficients: "
-                "[k1, k2, p1, p2, k3], or remove the key"
+                "distortion_coefficients: [k1, k2, p1, p2, k3], or remove the key"
             )
         return camera
 
@@ -165,9 +165,7 @@ class _Cameras:
         raise InvalidInputError((f"no camera {name!r}; " if name else "several cameras; ") + advice)
 
 
-def _found(
-    value: Any, path: tuple[str, ...], around: tuple[Mapping[str, Any], ...]
-) -> Iterator[_Found]:
+def _found(value: Any, path: tuple[str, ...], around: tuple[Document, ...]) -> Iterator[_Found]:
     """The cameras in a document, each before those inside it."""
     if isinstance(value, list):
         for index, item in enumerate(value):
@@ -190,7 +188,7 @@ def _with_nested_cameras(document: Any) -> Any:
     other documents as they are. What ORB-SLAM says of ``Camera`` counts for ``Camera1`` too."""
     if not isinstance(document, dict):
         return document
-    cameras: dict[str, dict[str, Any]] = {}
+    cameras: dict[str, Fields] = {}
     rest = {}
     for key, value in document.items():
         if match := _DOTTED.fullmatch(key):
@@ -213,7 +211,7 @@ def _with_stereo_pair(document: Any) -> Any:
         (inside,) = inside.values()
     if not isinstance(inside, dict):
         return document
-    pairs: dict[str, dict[str, Any]] = {}
+    pairs: dict[str, Fields] = {}
     rest = {}
     for key, value in inside.items():
         match = _STEREO.fullmatch(plain(key))

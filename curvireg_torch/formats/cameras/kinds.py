@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ...errors import CurviregWarning, InvalidInputError
+from ...utils.aliases import Size
 from ..documents import number
 from .record import CameraRecord, Record, flattened, plain
 
@@ -102,18 +103,22 @@ class Format:
     """One kind of calibration.
 
     Attributes:
-        name: as messages call it.
-        detect: whether a dict of a file is a camera of this format.
+        keys: of a dict of a file that is a camera of this format, see :meth:`Record.matches`.
         parse: its camera.
         others: further cameras that it describes, by names that ``FILE:NAME`` may give.
         inherits: whether what the dicts around it say counts for each of several cameras in them.
+        also: what else such a dict must be.
     """
 
-    name: str
-    detect: Callable[[Record], bool]
+    keys: str
     parse: Callable[[Record], CameraRecord]
     others: Mapping[str, Callable[[Record], CameraRecord]] = field(default_factory=dict)
     inherits: bool = False
+    also: Callable[[Record], bool] = lambda _: True
+
+    def detect(self, record: Record) -> bool:
+        """Whether a dict of a file is a camera of this format."""
+        return record.matches(self.keys) and self.also(record)
 
 
 def _camera_from(
@@ -281,7 +286,7 @@ def _read_size(record: Record) -> list[float]:
     return sides or record.numbers(*WIDTH) + record.numbers(*HEIGHT)
 
 
-def _checked_size(size: Sequence[float]) -> tuple[int, int] | None:
+def _checked_size(size: Sequence[float]) -> Size | None:
     """(H, W) of width and height."""
     if len(size) not in (0, 2) or any(side != int(side) for side in size):
         raise InvalidInputError(
@@ -321,7 +326,7 @@ def _unknown_order(record: Record) -> CameraRecord:
         return camera
     cx, cy = (row[2] for row in camera.matrix[:2])
 
-    def distance(size: tuple[int, int]) -> float:
+    def distance(size: Size) -> float:
         return abs(cx / size[1] - 0.5) + abs(cy / size[0] - 0.5)
 
     return replace(camera, size=min(camera.size, camera.size[::-1], key=distance))
@@ -344,6 +349,10 @@ def _matlab(record: Record) -> CameraRecord:
     columns, rows, last = camera.matrix
     matrix = ((*columns[:2], columns[2] - 1.0), (*rows[:2], rows[2] - 1.0), last)
     return replace(camera, matrix=matrix, size=camera.size and camera.size[::-1])
+
+
+def _is_own_result(record: Record) -> bool:
+    return record.get("model") in CAMERA_MODELS
 
 
 def _own_result(record: Record) -> CameraRecord:
@@ -527,17 +536,17 @@ def _mei(record: Record) -> CameraRecord:
 
 
 UNREAD = {
-    "cameraAperture cameraFocalLength": (
+    "cameraAperture|cameraFocalLength": (
         "camera_params of Isaac Sim; write fx = width * cameraFocalLength / cameraAperture[0], fy "
         "= height * cameraFocalLength / cameraAperture[1], cx = (width - 1) / 2 and cy = (height - "
         "1) / 2"
     ),
-    "pxFocalLength sensorWidth": (
+    "pxFocalLength|sensorWidth": (
         "cameras of Meshroom; export them as COLMAP, or write fx = fy = width * focalLength / "
         "sensorWidth, cx = width / 2 + principalPoint[0] - 0.5 and cy = height / 2 + "
         "principalPoint[1] - 0.5"
     ),
-    "android.lens.intrinsicCalibration LENS_INTRINSIC_CALIBRATION intrinsicCalibration": (
+    "android.lens.intrinsicCalibration|LENS_INTRINSIC_CALIBRATION|intrinsicCalibration": (
         "a calibration of Android's Camera2; write its first four numbers as fx, fy, cx, cy, its "
         "lens distortion (a, b, c, d, e) as distortion_coefficients: [a, b, d, e, c], and the "
         "size of the pre-correction active array as width and height"
@@ -552,55 +561,22 @@ def _unread(keys: str, sentence: str) -> Format:
     def refuse(_: Record) -> CameraRecord:
         raise InvalidInputError(sentence)
 
-    names = keys.split()
-    return Format(keys, lambda record: record.has(*names), refuse)
+    return Format(keys, refuse)
 
 
 FORMATS = (
     *(_unread(keys, sentence) for keys, sentence in UNREAD.items()),
-    Format("COLMAP", lambda record: "colmap" in record.values, _colmap),
-    Format("KITTI", lambda record: "kitti" in record.values, _kitti),
-    Format(
-        "nerfstudio",
-        lambda record: record.has("fl_x") or record.has("camera_angle_x"),
-        _nerfstudio,
-        inherits=True,
-    ),
-    Format(
-        "OpenSfM",
-        lambda record: record.has("projection_type") and record.has("focal", "focal_x"),
-        _opensfm,
-    ),
-    Format(
-        "camodocal, Kannala-Brandt",
-        lambda record: record.has("mu") and record.has("mv"),
-        _kannala_brandt,
-    ),
-    Format("camodocal, MEI", lambda record: record.has("gamma1"), _mei),
-    Format(
-        "Metashape",
-        lambda record: (
-            record.has(ONE_FOCAL)
-            and not record.has("fx")
-            and record.has("projection", "class", "type", "b1", "date")
-        ),
-        _metashape,
-    ),
-    Format(
-        "ROS",
-        lambda record: (
-            _is_plain(record) and record.has("P", "projection_matrix", "binning_x", "roi")
-        ),
-        _ros,
-        {"P": _ros_rectified},
-    ),
-    Format(
-        "result.json",
-        lambda record: record.has("matrix") and record.get("model") in CAMERA_MODELS,
-        _own_result,
-    ),
-    Format("MATLAB", _is_matlab, _matlab),
-    Format("MegaPose", _has_pair_of_sides, _unknown_order),
-    Format("OpenCV", _is_plain, _plain_camera),
+    Format("colmap", _colmap),
+    Format("kitti", _kitti),
+    Format("fl_x|camera_angle_x", _nerfstudio, inherits=True),
+    Format("projection_type focal|focal_x", _opensfm),
+    Format("mu mv", _kannala_brandt),
+    Format("gamma1", _mei),
+    Format("f !fx projection|class|type|b1|date", _metashape),
+    Format("P|projection_matrix|binning_x|roi", _ros, {"P": _ros_rectified}, also=_is_plain),
+    Format("matrix model", _own_result, also=_is_own_result),
+    Format("", _matlab, also=_is_matlab),
+    Format("", _unknown_order, also=_has_pair_of_sides),
+    Format("", _plain_camera, also=_is_plain),
 )
 """The first that detects a dict reads it."""

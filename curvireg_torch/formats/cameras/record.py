@@ -1,11 +1,12 @@
 """The keys and values of one camera in a calibration file, and which of them were read."""
 
 import re
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from ...errors import InvalidInputError
+from ...utils.aliases import Document, Size
 from ...utils.files import finite_numbers
 from ..documents import number
 
@@ -43,7 +44,7 @@ class CameraRecord:
     matrix: tuple[tuple[float, ...], ...]
     distortion: tuple[float, ...] = ()
     model: str = "radial-tangential"
-    size: tuple[int, int] | None = None
+    size: Size | None = None
     focal_deviation: float = 0.0
     source: str = "given"
 
@@ -57,9 +58,7 @@ class Record:
         around: enclosing dicts, the innermost first.
     """
 
-    def __init__(
-        self, values: Mapping[str, Any], used: Used, around: Sequence[Mapping[str, Any]] = ()
-    ) -> None:
+    def __init__(self, values: Document, used: Used, around: Sequence[Document] = ()) -> None:
         self.values = values
         self.used = used
         self.around = around
@@ -67,6 +66,13 @@ class Record:
     def has(self, *names: str) -> bool:
         """Whether the dict itself has one of the keys."""
         return not set(map(plain, names)).isdisjoint(map(plain, self.values))
+
+    def matches(self, rule: str) -> bool:
+        """Whether the dict itself has the keys of a rule: all of its words, of ``a|b`` one of the
+        two, and none of ``!a``."""
+        return all(
+            self.has(*word.lstrip("!").split("|")) != word.startswith("!") for word in rule.split()
+        )
 
     def lengths(self, *names: str) -> list[int]:
         """How many values each of the keys holds that the dict itself has."""
@@ -136,9 +142,7 @@ def distortion_keys(value: Any, others: Container[int]) -> Iterator[tuple[int, s
         yield from distortion_keys_inside(value, others)
 
 
-def distortion_keys_inside(
-    values: Mapping[str, Any], others: Container[int]
-) -> Iterator[tuple[int, str]]:
+def distortion_keys_inside(values: Document, others: Container[int]) -> Iterator[tuple[int, str]]:
     """:func:`distortion_keys` of a dict that counts, whoever else it belongs to."""
     for key, value in values.items():
         is_camera = id(value) in others

@@ -3,11 +3,11 @@
 import argparse
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from ...errors import InvalidInputError
+from ...utils.aliases import Document, Size
 from ...utils.choices import UNITS
 from ...utils.files import write_file
 
@@ -19,7 +19,7 @@ OPTICAL_FRAME = "camera_optical_frame"
 ORDER = (3, 4, 5, 0, 1, 2)  # of x, y, z and rotations about them, among our rotations, x, y, z
 
 
-def time_stamp(text: str) -> tuple[int, int]:
+def time_stamp(text: str) -> Size:
     """Type of an option: seconds and nanoseconds.
 
     Example:
@@ -34,9 +34,9 @@ def time_stamp(text: str) -> tuple[int, int]:
 
 def write_ros(
     out: Path,
-    document: Mapping[str, Any],
+    document: Document,
     *,
-    stamp: tuple[int, int] = (0, 0),
+    stamp: Size = (0, 0),
     frame: str = OPTICAL_FRAME,
     child: str = "object",
 ) -> None:

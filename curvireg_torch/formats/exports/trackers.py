@@ -1,14 +1,14 @@
 """A start pose and the mesh as other trackers read them: M3T (and pym3t), and ViSP; in metres."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 
 from ...errors import InvalidInputError
+from ...utils.aliases import Document
 from ...utils.choices import UNITS
 from ...utils.files import write_file
 
@@ -27,7 +27,7 @@ def write_m3t(
     out: Path,
     vertices: np.ndarray,
     faces: np.ndarray,
-    document: Mapping[str, Any],
+    document: Document,
     *,
     is_closed: bool,
 ) -> None:
@@ -68,9 +68,7 @@ def _opencv_matrix(T: np.ndarray) -> str:
     return f"!!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: d\n  data: [{numbers}]"
 
 
-def write_visp(
-    out: Path, vertices: np.ndarray, faces: np.ndarray, document: Mapping[str, Any]
-) -> None:
+def write_visp(out: Path, vertices: np.ndarray, faces: np.ndarray, document: Document) -> None:
     """Write the ``VISP_FILES`` into the folder ``out``; arguments and errors are those of
     :func:`write_m3t`. Coplanar triangles are one polygon."""
     T, metres = _pose_in_metres(document, "visp")
@@ -110,7 +108,7 @@ def write_visp(
     write_file(out / "object.pos", "".join(f"{x:.12g}\n" for x in numbers).encode())
 
 
-def _pose_in_metres(document: Mapping[str, Any], name: str) -> tuple[np.ndarray, float]:
+def _pose_in_metres(document: Document, name: str) -> tuple[np.ndarray, float]:
     """(4, 4) of the pose in the camera, and the length of the mesh's unit in metres."""
     if document["translation"] is None:
         raise InvalidInputError(f"--format {name}: a pose without translation; give a camera")

@@ -19,6 +19,7 @@ from ...errors import (
     MAX_MESH_BYTES,
     MAX_TEXTURE_PIXELS,
 )
+from ...utils.aliases import Size
 from ...utils.choices import UNITS
 from ...utils.extras import check_extras
 from ...utils.programs import run_program
@@ -200,7 +201,7 @@ def _check_copies(root: Any) -> None:
     are counted first."""
     named = {f"#{one.get('id')}": one for one in root.iter() if one.get("id")}
     nodes = {url: one for url, one in named.items() if local_name(one) == "node"}
-    known: dict[Any, tuple[int, int]] = {}
+    known: dict[Any, Size] = {}
     faces_of: dict[str, int] = {}
 
     def faces(url: str) -> int:
@@ -211,7 +212,7 @@ def _check_copies(root: Any) -> None:
             faces_of[url] = sum(map(_most_faces, shapes))
         return faces_of[url]
 
-    def count(node: Any, depth: int) -> tuple[int, int]:
+    def count(node: Any, depth: int) -> Size:
         if node in known:
             return known[node]
         if depth > 200:

@@ -7,12 +7,12 @@ import re
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import CurviregError, MeshError, MissingFileError
+from ...utils.aliases import PathName
 from ...utils.choices import MESHES
 from ...utils.files import file_digest, foreign_content, text_digest
 from .cad import read_collada, read_step
@@ -59,10 +59,10 @@ def mesh_digest(path: Path, *, textures: Iterable[Path] = ()) -> str:
 
 
 def read_mesh(
-    path: str | PathLike[str],
+    path: PathName,
     *,
     link: str | None = None,
-    textures: str | PathLike[str] | None = None,
+    textures: PathName | None = None,
 ) -> ReadMesh:
     """Read a mesh file: polygons become triangles, parts lie at their places, and nothing is
     rescaled, cleaned or checked for use.

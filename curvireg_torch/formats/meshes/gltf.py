@@ -19,13 +19,11 @@ import numpy as np
 from trimesh.transformations import quaternion_matrix
 
 from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TABLE_BYTES
-from ...utils.arrays import Array, Bytes, Floats, Integers
+from ...utils.aliases import Array, Bytes, Fields, Floats, Integers
 from ...utils.srgb import srgb
 from .colours import Painting, SurfaceColours, byte_colours
 from .limits import check_faces, check_parts
 from .source import MeshSource, ReadMesh, as_plain_numbers
-
-Tree = dict[str, Any]
 
 # Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or are
 # read here
@@ -119,7 +117,7 @@ def _natural(value: Any) -> int:
     return value
 
 
-def _check_sizes(tree: Tree) -> None:
+def _check_sizes(tree: Fields) -> None:
     """Bounds on views of buffers, accessors, and every copy of a part."""
     accessors = tree.get("accessors", [])
     copied = sum(_natural(view["byteLength"]) for view in tree.get("bufferViews", []))
@@ -139,7 +137,7 @@ def _check_sizes(tree: Tree) -> None:
             )
         return int(accessor["count"])
 
-    def corners(part: Tree) -> int:
+    def corners(part: Fields) -> int:
         """Corners of the faces of a part, or its vertices if these are more."""
         used = [*part["attributes"].values(), *([part["indices"]] if "indices" in part else [])]
         factor = 3 if part.get("mode") in (_STRIP, _FAN) else 1
@@ -154,7 +152,7 @@ def _check_sizes(tree: Tree) -> None:
     check_faces(sum(most for _, most in copies) / 3)
 
 
-def _check_nodes(tree: Tree) -> None:
+def _check_nodes(tree: Fields) -> None:
     """Every node must be the child of one node at most, and a root of none: else the nodes form a
     circle, or more."""
     nodes = tree.get("nodes", [])
@@ -173,12 +171,12 @@ def _check_nodes(tree: Tree) -> None:
 class _File:
     """A checked glTF tree and what it names."""
 
-    def __init__(self, tree: Tree, binary: bytes | None, source: MeshSource) -> None:
+    def __init__(self, tree: Fields, binary: bytes | None, source: MeshSource) -> None:
         self._tree = tree
         self._binary = binary
         self._source = source
         self._buffers: dict[int, bytes] = {}
-        self._parts: dict[int, list[tuple[Tree, ReadMesh]]] = {}
+        self._parts: dict[int, list[tuple[Fields, ReadMesh]]] = {}
         self._skins: dict[int, Floats] = {}
         self._places = dict(self._nodes())
 
@@ -191,7 +189,7 @@ class _File:
                 found += [self._placed(node, place, *part) for part in self._mesh(node["mesh"])]
         return ReadMesh.joined(found)
 
-    def _placed(self, node: Tree, place: Floats, part: Tree, mesh: ReadMesh) -> ReadMesh:
+    def _placed(self, node: Fields, place: Floats, part: Fields, mesh: ReadMesh) -> ReadMesh:
         attributes = part["attributes"]
         if "skin" not in node or not {"JOINTS_0", "WEIGHTS_0"} <= attributes.keys():
             return mesh.transformed(place)
@@ -242,7 +240,7 @@ class _File:
             yield index, place
             waiting += [(child, place) for child in reversed(nodes[index].get("children", []))]
 
-    def _mesh(self, index: int) -> list[tuple[Tree, ReadMesh]]:
+    def _mesh(self, index: int) -> list[tuple[Fields, ReadMesh]]:
         if index not in self._parts:
             mesh = self._tree["meshes"][index]
             if any(mesh.get("weights", [])):
@@ -257,7 +255,7 @@ class _File:
             ]
         return self._parts[index]
 
-    def _part(self, part: Tree) -> ReadMesh:
+    def _part(self, part: Fields) -> ReadMesh:
         vertices = self._accessor(part["attributes"]["POSITION"])
         if "indices" in part:
             indices = self._accessor(part["indices"], as_stored=True)[:, 0].astype(np.int64)
@@ -268,7 +266,7 @@ class _File:
         faces = _faces(indices, part.get("mode", _TRIANGLES))
         return ReadMesh(vertices, faces, self._colours(part, faces, len(vertices)))
 
-    def _colours(self, part: Tree, faces: Integers, count: int) -> SurfaceColours | None:
+    def _colours(self, part: Fields, faces: Integers, count: int) -> SurfaceColours | None:
         """Vertex colours times the colour of the material times its texture."""
         attributes = part["attributes"]
         if "material" not in part and "COLOR_0" not in attributes:
@@ -290,7 +288,7 @@ class _File:
                 painting.add_texture(slice(None), texture, uv[faces])
         return painting.finished()
 
-    def _coordinates(self, info: Tree, attributes: dict[str, int], count: int) -> Floats | None:
+    def _coordinates(self, info: Fields, attributes: dict[str, int], count: int) -> Floats | None:
         """(V, 2) texture coordinates from the bottom left, in the set and by the transform that the
         texture names."""
         transform = info.get("extensions", {}).get(_TRANSFORM, {})
@@ -313,7 +311,7 @@ class _File:
         turned = scaled @ np.array([[cos, -sin], [sin, cos]]) + offset
         return np.asarray(np.array([0.0, 1.0]) + turned * np.array([1.0, -1.0]))
 
-    def _texture(self, info: Tree) -> Bytes | None:
+    def _texture(self, info: Fields) -> Bytes | None:
         texture = self._tree["textures"][_natural(info["index"])]
         webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
         index = webp.get("source", texture.get("source"))
@@ -349,7 +347,7 @@ class _File:
             values = np.maximum(values / np.iinfo(kind).max, -1.0)
         return values
 
-    def _stored(self, place: Tree, kind: np.dtype[Any], width: int, count: int) -> Array:
+    def _stored(self, place: Fields, kind: np.dtype[Any], width: int, count: int) -> Array:
         """(count, width) values at the ``place`` in a view that an accessor, or a part of one,
         names; zeros where it names none."""
         if "bufferView" not in place:
@@ -363,7 +361,7 @@ class _File:
             raise ValueError("an accessor is longer than its data; the file ends too early")
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
 
-    def _with_exceptions(self, stored: Array, sparse: Tree) -> Array:
+    def _with_exceptions(self, stored: Array, sparse: Fields) -> Array:
         """Values of a sparse accessor: those stored, but for some, which are named one by one."""
         count = _natural(sparse["count"])
         if count > len(stored):
@@ -403,7 +401,7 @@ class _File:
         return self._buffers[index]
 
 
-def _local(node: Tree) -> Floats:
+def _local(node: Fields) -> Floats:
     """(4, 4) place of a node below its parent."""
     if "matrix" in node:
         return as_plain_numbers(node["matrix"], 16, ()).reshape(4, 4).T
@@ -427,7 +425,7 @@ def _faces(indices: Integers, mode: int) -> Integers:
     return faces
 
 
-def _base_colour(material: Tree) -> tuple[Floats, Tree | None]:
+def _base_colour(material: Fields) -> tuple[Floats, Fields | None]:
     """(3,) linear colour of a material, and its texture, if any."""
     specular = material.get("extensions", {}).get(_SPECULAR)
     metallic = material.get("pbrMetallicRoughness", {})

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
-from ...utils.arrays import Array, Bytes, Floats, Integers
+from ...utils.aliases import Array, Bytes, Fields, Floats, Integers
 from .colours import Painting, SurfaceColours
 from .limits import check_lines
 from .polygons import triangles_of_faces
@@ -57,7 +57,7 @@ def read_ply(source: MeshSource) -> ReadMesh:
     raw = trimesh.exchange.ply.load_ply(
         BytesIO(plain + end + body), skip_materials=True, fix_texture=False
     )
-    elements: dict[str, dict[str, Any]] = raw["metadata"]["_ply_raw"]
+    elements: dict[str, Fields] = raw["metadata"]["_ply_raw"]
     for name, element in elements.items():
         values = element.get("data")
         rows = list(values.values()) if isinstance(values, dict) else [values]
@@ -91,7 +91,7 @@ class _Faces(NamedTuple):
 class _Element:
     """One kind of rows of the file: its columns by name."""
 
-    def __init__(self, element: dict[str, Any]) -> None:
+    def __init__(self, element: Fields) -> None:
         self._data = element.get("data")
         self.names: list[str] = []
         if isinstance(self._data, dict):

@@ -15,7 +15,7 @@ import trimesh
 from trimesh.transformations import euler_matrix
 
 from ...errors import MAX_TABLE_BYTES, MeshError
-from ...utils.arrays import Bytes, Floats
+from ...utils.aliases import Bytes, Fields, Floats
 from ...utils.choices import UNITS
 from ..xml_files import read_xml
 from .colours import SurfaceColours, byte_colours
@@ -51,7 +51,7 @@ def read_urdf(source: MeshSource, read_part: ReadPart, link: str | None = None) 
     return replace(ReadMesh.joined(parts), unit="m", up="z")
 
 
-def _places(robot: Any, links: dict[str, Any]) -> dict[str, Floats]:
+def _places(robot: Any, links: Fields) -> dict[str, Floats]:
     """The place of each link in the root's frame, all joints at zero."""
     above: dict[str, tuple[str, Floats]] = {}
     for joint in robot.findall("joint"):

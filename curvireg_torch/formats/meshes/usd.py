@@ -7,7 +7,6 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from ...errors import (
     MAX_MESH_FACES,
     MAX_MESH_PARTS,
 )
-from ...utils.arrays import Array, Bytes, Integers
+from ...utils.aliases import Array, Bytes, Fields, Integers
 from ...utils.programs import run_program
 from ...utils.srgb import srgb
 from .cad import bounded
@@ -47,7 +46,7 @@ def read_usd(source: MeshSource) -> ReadMesh:
     return mesh if about["metres"] is None else mesh.in_unit_of(about["metres"])
 
 
-def _parts_of(path: Path) -> tuple[dict[str, Any], Arrays]:
+def _parts_of(path: Path) -> tuple[Fields, Arrays]:
     """What OpenUSD finds in a file, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "parts.npz")
@@ -72,7 +71,7 @@ def _parts_of(path: Path) -> tuple[dict[str, Any], Arrays]:
     return about, arrays
 
 
-def _part(source: MeshSource, key: str, part: dict[str, Any], arrays: Arrays) -> ReadMesh:
+def _part(source: MeshSource, key: str, part: Fields, arrays: Arrays) -> ReadMesh:
     """One mesh at its place, with its colours."""
     vertices = arrays[key + "points"]
     counts = arrays[key + "counts"]
@@ -93,7 +92,7 @@ def _part(source: MeshSource, key: str, part: dict[str, Any], arrays: Arrays) ->
 def _colours(
     source: MeshSource,
     key: str,
-    part: dict[str, Any],
+    part: Fields,
     arrays: Arrays,
     corner: Integers,
     material: Integers,
@@ -118,7 +117,7 @@ def _colours(
     return painting.finished()
 
 
-def _tint(source: MeshSource, surface: dict[str, Any]) -> Bytes:
+def _tint(source: MeshSource, surface: Fields) -> Bytes:
     """(3,) what the colours of a texture are multiplied by."""
     scale = np.array(surface.get("scale", (1.0, 1.0, 1.0)))
     if scale.max() > 1.0 or any(surface.get("bias", ())):
@@ -126,7 +125,7 @@ def _tint(source: MeshSource, surface: dict[str, Any]) -> Bytes:
     return byte_colours(srgb(scale))
 
 
-def _texture(source: MeshSource, surface: dict[str, Any]) -> Bytes | None:
+def _texture(source: MeshSource, surface: Fields) -> Bytes | None:
     """The pixels of a texture: a file beside the mesh, or in a package."""
     name = str(surface["texture"])
     inner = str(surface["inner"])
