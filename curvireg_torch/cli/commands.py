@@ -65,13 +65,11 @@ def _add_bank(commands: Any) -> None:
 
 def _build_bank(arguments: argparse.Namespace) -> None:
     """Build and save a bank."""
-    check_given([], [arguments.mesh])
+    check_given([], [arguments.mesh], banks=False)
     if arguments.out.suffix != ".safetensors" or arguments.out.is_dir():
         raise InvalidInputError(
             f"--out {arguments.out}: expected the name of a file that ends in .safetensors"
         )
-    if arguments.mesh.suffix == ".safetensors":
-        raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
     load_libraries()
     from ..jobs.outputs import check_output_file
     from ..matching import ViewBank

@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 from typing import Any, Self
 
-from ..errors import InvalidInputError
 from ..jobs.options import whole_number
 from ..utils.choices import check_given
 from ..utils.files import write_file
@@ -97,9 +96,7 @@ class StageBars:
 
 def _run_inspect(arguments: argparse.Namespace) -> int:
     """Write the report and print it."""
-    check_given([], [arguments.mesh])
-    if arguments.mesh.suffix == ".safetensors":
-        raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
+    check_given([], [arguments.mesh], banks=False)
     load_libraries()
     from ..inspection import inspect
     from ..inspection.page import report_lines, report_page

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import ImageError, InvalidInputError, MissingFileError
 from ..utils.aliases import Array, PathName, Singles
+from ..utils.choices import listed
 from .boxes import PictureSize
 from .pictures import as_in_file, decoded, oriented
 
@@ -88,11 +89,9 @@ def mask_of_values(values: Array, largest: int) -> Singles:
     if len(labels) == 1:
         return np.asarray(values == labels[0], dtype=np.float32)
     if len(labels) > 1:
-        listed = ", ".join(map(str, labels[:MAX_LISTED])) + (
-            ", ..." if len(labels) > MAX_LISTED else ""
-        )
         raise InvalidInputError(
-            f"mask: no white pixel, but labels {listed}; choose one as FILE:LABEL, or mask == LABEL"
+            f"mask: no white pixel, but labels {listed(labels, MAX_LISTED)}; choose one as "
+            "FILE:LABEL, or mask == LABEL"
         )
     return np.zeros(values.shape, np.float32)
 
@@ -100,12 +99,9 @@ def mask_of_values(values: Array, largest: int) -> Singles:
 def _labelled(values: Array, label: int, file: Path) -> Singles:
     chosen = np.equal(values, label)
     if not chosen.any():
-        labels = np.unique(values)
-        listed = ", ".join(map(str, labels[:MAX_LISTED])) + (
-            ", ..." if len(labels) > MAX_LISTED else ""
-        )
+        labels = listed(np.unique(values), MAX_LISTED)
         raise InvalidInputError(
-            f"mask: no pixel has the label {label}; it has {listed}", subject=file
+            f"mask: no pixel has the label {label}; it has {labels}", subject=file
         )
     return np.asarray(chosen, dtype=np.float32)
 

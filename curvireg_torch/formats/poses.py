@@ -11,6 +11,7 @@ from trimesh.transformations import quaternion_matrix
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.aliases import Document, Floats
+from ..utils.choices import listed
 from ..utils.files import check_table_size, finite_numbers, split_name
 from .cameras.record import flattened, plain
 from .documents import read_document
@@ -106,9 +107,8 @@ def _named(content: Any, name: str, mesh: str) -> Any:
         (image,) = images
     chosen = {key.lstrip("0"): value for key, value in images.items()}.get(image.lstrip("0"))
     if chosen is None or not image:
-        listed = ", ".join(list(images)[:8]) + (", ..." if len(images) > 8 else "")
         raise InvalidInputError(
-            f"poses of several images; choose one as FILE:IMAGE_ID from {listed}"
+            f"poses of several images; choose one as FILE:IMAGE_ID from {listed(images)}"
         )
     return _item(chosen, index, mesh)
 
@@ -129,7 +129,7 @@ def _item(items: Sequence[Any], name: str, mesh: str) -> Any:
         own = [k for k, label in enumerate(labels) if label and label == mesh]
         chosen = own or [*range(len(items))]
     if len(chosen) != 1:
-        names = ", ".join(label or str(index) for index, label in enumerate(labels[:8]))
+        names = listed(label or index for index, label in enumerate(labels))
         raise InvalidInputError(
             f"expected one pose, got {len(chosen)} of {len(items)}; choose one as FILE:NAME: "
             f"{names}"

@@ -15,6 +15,7 @@ from ..utils.checks import (
     check_pose,
     check_rotation,
 )
+from .conversions import matrix_of_rows
 
 MAX_BOX_ITERATIONS = 20
 MIN_BOX_STEP = 1e-9  # change of the position in an iteration, relative to the position
@@ -153,7 +154,7 @@ def rotation_towards(rays: Tensor) -> Tensor:
     # Rodrigues with axis (0, 0, 1) x ray = (-y, x, 0): R = I + [v] + [v]^2 / (1 + z).
     f = 1.0 / (1.0 + z)
     rows = [1.0 - f * x * x, -f * x * y, x], [-f * x * y, 1.0 - f * y * y, y], [-x, -y, z]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    return matrix_of_rows(rows)
 
 
 def turn_with_ray(position: Tensor) -> Tensor:
@@ -164,7 +165,7 @@ def turn_with_ray(position: Tensor) -> Tensor:
     x, y, z = ray.unbind()
     zero = torch.zeros_like(x)
     rows = [zero, -z, y], [z, zero, -x], [-y, x, zero]
-    across = torch.stack([torch.stack(row) for row in rows])  # ray x difference
+    across = matrix_of_rows(rows)  # ray x difference
     roll = torch.stack([y, -x, zero]) / (1.0 + z)
     turn: Tensor = (across + torch.outer(ray, roll)) / distance
     return turn

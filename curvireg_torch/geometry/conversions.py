@@ -95,6 +95,11 @@ def cross_matrix(vector: Tensor) -> Tensor:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(*vector.shape, 3)
 
 
+def matrix_of_rows(rows: Sequence[Sequence[Tensor]]) -> Tensor:
+    """(..., M, N) matrices of M rows of N entries (...)."""
+    return torch.stack([torch.stack(tuple(row), -1) for row in rows], -2)
+
+
 def symmetry_transforms(info: Document, *, max_step_fraction: float = 0.01) -> Tensor:
     """All symmetries of an object as 4x4 transforms, from its entry in BOP's ``models_info.json``.
 

@@ -10,6 +10,7 @@ from ..errors import MAX_BOX_COORDINATE, InvalidInputError
 from ..utils.aliases import Size
 from ..utils.checks import as_boxes, check_integer, check_positive, check_tensor
 from ..utils.likes import BoxesLike
+from .conversions import matrix_of_rows
 
 SAMPLES_AT_A_TIME = 64  # of a matrix product: fewer are slow, more multiply by many zeros
 
@@ -114,8 +115,7 @@ def image_transforms(squares: Tensor, size: int) -> Tensor:
 def _scale_and_shift(scale: Tensor, x: Tensor, y: Tensor) -> Tensor:
     zero = torch.zeros_like(scale)
     one = torch.ones_like(scale)
-    rows = [torch.stack(row, -1) for row in ([scale, zero, x], [zero, scale, y], [zero, zero, one])]
-    return torch.stack(rows, -2)
+    return matrix_of_rows([[scale, zero, x], [zero, scale, y], [zero, zero, one]])
 
 
 def crop_images(
@@ -197,6 +197,12 @@ def crop_squares(image: Tensor, squares: Tensor, size: int) -> Tensor:
     return crops
 
 
+def _triangle(samples: Tensor, centres: Tensor, widths: Tensor) -> Tensor:
+    """Weights of samples (N,), of sum 1, for filters with centres and widths (..., 1)."""
+    weights = (1.0 - (samples - centres).abs() / widths).clamp(min=0.0)
+    return weights / weights.sum(dim=-1, keepdim=True)
+
+
 class _Resampling:
     """Triangle filters, at least one pixel wide, that resample an axis of ``length`` between K
     pairs of borders (K,), from the input from ``first`` to ``end``. Neighbouring samples, of
@@ -217,8 +223,7 @@ class _Resampling:
         samples = torch.arange(self.first, self.end, dtype=self._centres.dtype, device=device)
         centres = self._centres.to(device)[..., None]
         widths = self._widths.to(device)[..., None]
-        weights = (1.0 - (samples - centres).abs() / widths).clamp(min=0.0)
-        return weights / weights.sum(dim=-1, keepdim=True)
+        return _triangle(samples, centres, widths)
 
     def __call__(self, x: Tensor, crop: int | None = None) -> Tensor:
         """(C, samples, W) of one crop, or of all in sequence, from the (C, end - first, W) input,
@@ -243,7 +248,6 @@ class _Resampling:
                 torch.arange(low, low + part.shape[1], device=centre.device, dtype=centre.dtype)
                 + self.first
             )
-            weights = (1.0 - (samples - centre[:, None]).abs() / width[:, None]).clamp(min=0.0)
-            parts.append((weights / weights.sum(dim=1, keepdim=True)).to(part) @ part)
+            parts.append(_triangle(samples, centre[:, None], width[:, None]).to(part) @ part)
         resampled = torch.cat(parts, dim=1)
         return resampled if order is None else resampled.index_select(1, order.argsort())

@@ -28,6 +28,7 @@ from ..utils.checks import (
 )
 from ..utils.choices import UP_AXES
 from ..utils.rows import Rows
+from .conversions import matrix_of_rows
 
 
 def rotation_from_viewpoint(
@@ -65,7 +66,7 @@ def rotation_from_viewpoint(
         [-(st * ca + ct * se * -sa), -(st * sa + ct * se * ca), -ct * ce],
         [-ce * sa, ce * ca, -se],
     ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+    return matrix_of_rows(rows)
 
 
 def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:

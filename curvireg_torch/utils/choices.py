@@ -3,7 +3,7 @@ imported."""
 
 import glob
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from ..errors import InvalidInputError, MissingFileError
@@ -90,6 +90,17 @@ UP_AXES = {
 _ORDER = "the photograph comes first, the mesh last"
 
 
+def listed(names: Iterable[object], most: int = 8) -> str:
+    """The first names, and whether there are more, for a message.
+
+    Example:
+        >>> listed("abc", 2)
+        'a, b, ...'
+    """
+    texts = [*map(str, names)]
+    return ", ".join([*texts[:most], *["..."][: len(texts) - most > 0]])
+
+
 def _is_pattern(path: Path) -> bool:
     """Whether a path is a pattern of several, such as ``shots/*.jpg``."""
     return bool(pattern_of(path))
@@ -123,9 +134,11 @@ def check_given(
     listed: Path | None = None,
     *,
     packages: Sequence[str] = (),
+    banks: bool = True,
 ) -> None:
     """Refuse files of another kind, swapped files, a missing list, mesh or only photograph, and
-    files whose readers are not installed, together with ``packages`` that are not.
+    files whose readers are not installed, together with ``packages`` that are not; also banks in
+    the place of meshes, unless ``banks`` will do.
 
     Of several photographs, those that are missing are reported later, each by itself.
     """
@@ -148,6 +161,8 @@ def check_given(
                 f"a list where a photograph is expected; give it as --list {path}", subject=path
             )
     for mesh in meshes:
+        if mesh.suffix == ".safetensors" and not banks:
+            raise InvalidInputError("a bank where a mesh is expected", subject=mesh)
         is_picture = _is_pattern(mesh) or mesh.suffix.lower() in (*IMAGES, *VIDEOS)
         if mesh.is_dir() or is_picture:
             kind = "a photograph" if is_picture else "a folder"

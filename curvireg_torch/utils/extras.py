@@ -19,16 +19,9 @@ EXTRAS = {
 
 PACKAGE_OF_SUFFIX = {
     ".dae": "collada",
-    ".heic": "pi_heif",
-    ".heif": "pi_heif",
-    ".iges": "cascadio",
-    ".igs": "cascadio",
-    ".step": "cascadio",
-    ".stp": "cascadio",
-    ".usd": "pxr",
-    ".usda": "pxr",
-    ".usdc": "pxr",
-    ".usdz": "pxr",
+    **dict.fromkeys((".heic", ".heif"), "pi_heif"),
+    **dict.fromkeys((".iges", ".igs", ".step", ".stp"), "cascadio"),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "pxr"),
 }
 """The package that reads files of a suffix, in lower case."""
 

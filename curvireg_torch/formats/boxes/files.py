@@ -193,8 +193,8 @@ def _coco(content: Document) -> Iterator[ImageBox]:
             corners = (x + PIXEL_CENTRE, y + PIXEL_CENTRE, c + PIXEL_CENTRE, d + PIXEL_CENTRE)
         score = finite_numbers([fields.get("score", 1.0)], 1) or (0.0,)
         category = str(fields.get("category_id", ""))
-        name = str(categories.get(category, {}).get("name", ""))
-        labels = frozenset({category, str(fields.get("label", "")), name} - {""})
+        named = category, fields.get("label", ""), categories.get(category, {}).get("name", "")
+        labels = frozenset(map(str, named)) - {""}
         number = str(fields.get("image_id", ""))
         image = images.get(number, {})
         file_name = str(image.get("file_name", "") or number)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from ...errors import CurviregWarning, InvalidInputError, MissingFileError
 from ...utils.aliases import PathName, Size
-from ...utils.choices import BOX_FORMATS
+from ...utils.choices import BOX_FORMATS, listed
 from ...utils.files import split_name, without_zeros
 from .files import (
     ANY_FOLDER,
@@ -271,16 +271,15 @@ def _best(boxes: Sequence[ImageBox]) -> ImageBox:
     best = [box for box in boxes if box.score == most]
     tracks = dict.fromkeys(box.track for box in best)
     if len(tracks) > 1:
-        listed = ", ".join(filter(None, tracks))
         raise InvalidInputError(
-            f"boxes with a tracker's numbers ({listed}) and without scores; choose one as "
-            f"PATH:{ID_LABEL}NUMBER, or write scores (save_conf of ultralytics)"
+            f"boxes with a tracker's numbers ({listed(filter(None, tracks))}) and without scores; "
+            f"choose one as PATH:{ID_LABEL}NUMBER, or write scores (save_conf of ultralytics)"
         )
     kinds = dict.fromkeys(max(box.labels, key=_is_word, default="") for box in best)
     if len(kinds) > 1:
-        listed = ", ".join(list(kinds)[:8])
         raise InvalidInputError(
-            f"boxes of several labels, none with a higher score; choose one as PATH:LABEL: {listed}"
+            "boxes of several labels, none with a higher score; choose one as PATH:LABEL: "
+            f"{listed(kinds)}"
         )
     return best[0]
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from ...errors import MAX_CAMERA_BYTES, InvalidInputError, MissingFileError
 from ...utils.aliases import Document, Fields, PathName
+from ...utils.choices import listed
 from ...utils.files import split_name, without_zeros
 from ..documents import EXPECTED, read_document
 from .kinds import FORMATS, Format
@@ -140,7 +141,7 @@ class _Cameras:
         inside = distortion_keys_inside(chosen.values, self.identities)
         unread = [key for place, key in (*inside, *self.outside) if (place, key) not in used]
         if unread:
-            keys = ", ".join(repr(key) for key in list(dict.fromkeys(unread))[:4])
+            keys = listed(map(repr, dict.fromkeys(unread)), 4)
             raise InvalidInputError(
                 f"{keys}: looks like distortion, but is not read; write the coefficients as "
                 "distortion_coefficients: [k1, k2, p1, p2, k3], or remove the key"
@@ -157,11 +158,8 @@ class _Cameras:
         last = [camera.path[-1] if camera.path else "" for camera in self.found]
         unique = len(set(last)) == len(last)
         names = last if unique else ["/".join(camera.path) for camera in self.found]
-        names = [text for text in names if text]
-        listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
-        advice = (
-            f"choose one as FILE:NAME from {listed}" if listed.strip(", ") else "leave the name out"
-        )
+        choice = listed(filter(None, names))
+        advice = f"choose one as FILE:NAME from {choice}" if choice else "leave the name out"
         raise InvalidInputError((f"no camera {name!r}; " if name else "several cameras; ") + advice)
 
 

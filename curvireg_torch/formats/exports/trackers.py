@@ -1,14 +1,14 @@
 """A start pose and the mesh as other trackers read them: M3T (and pym3t), and ViSP; in metres."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import trimesh
 
 from ...errors import InvalidInputError
-from ...utils.aliases import Document
+from ...utils.aliases import Document, Floats
 from ...utils.choices import UNITS
 from ...utils.files import write_file
 
@@ -25,8 +25,8 @@ FLAT_ANGLE = 1e-3  # radians between triangles that are one polygon
 
 def write_m3t(
     out: Path,
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    vertices: Floats,
+    faces: Floats,
     document: Document,
     *,
     is_closed: bool,
@@ -47,7 +47,7 @@ def write_m3t(
     T, metres = _pose_in_metres(document, "m3t")
     lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices]
     lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
-    write_file(out / "object.obj", "\n".join([*lines, ""]).encode())
+    _write_lines(out / "object.obj", lines)
     body = [
         "%YAML:1.2",
         'geometry_path: "object.obj"',
@@ -55,20 +55,23 @@ def write_m3t(
         "geometry_counterclockwise: 1",
         f"geometry_enable_culling: {int(is_closed)}",
         f"geometry2body_pose: {_opencv_matrix(np.eye(4))}",
-        "",
     ]
-    write_file(out / "object.yaml", "\n".join(body).encode())
-    detector = ["%YAML:1.2", f"link2world_pose: {_opencv_matrix(T)}", ""]
-    write_file(out / "object_detector.yaml", "\n".join(detector).encode())
+    _write_lines(out / "object.yaml", body)
+    detector = ["%YAML:1.2", f"link2world_pose: {_opencv_matrix(T)}"]
+    _write_lines(out / "object_detector.yaml", detector)
 
 
-def _opencv_matrix(T: np.ndarray) -> str:
+def _write_lines(path: Path, lines: Iterable[str]) -> None:
+    write_file(path, "".join(f"{line}\n" for line in lines).encode())
+
+
+def _opencv_matrix(T: Floats) -> str:
     """(4, 4) in the YAML of OpenCV."""
     numbers = ", ".join(f"{x:.12g}" for x in T.ravel())
     return f"!!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: d\n  data: [{numbers}]"
 
 
-def write_visp(out: Path, vertices: np.ndarray, faces: np.ndarray, document: Document) -> None:
+def write_visp(out: Path, vertices: Floats, faces: Floats, document: Document) -> None:
     """Write the ``VISP_FILES`` into the folder ``out``; arguments and errors are those of
     :func:`write_m3t`. Coplanar triangles are one polygon."""
     T, metres = _pose_in_metres(document, "visp")
@@ -90,9 +93,8 @@ def write_visp(out: Path, vertices: np.ndarray, faces: np.ndarray, document: Doc
         "0",
         "# 3D circles",
         "0",
-        "",
     ]
-    write_file(out / "object.cao", "\n".join(cao).encode())
+    _write_lines(out / "object.cao", cao)
     some = points[_spread(points, INIT_POINTS)]
     init = [
         "# 3D points, in metres",
@@ -101,14 +103,13 @@ def write_visp(out: Path, vertices: np.ndarray, faces: np.ndarray, document: Doc
         "# 2D points: row and column, in pixels",
         str(len(some)),
         *(f"{v:.6f} {u:.6f}" for u, v in _pixels(some, T, document["camera"]["matrix"])),
-        "",
     ]
-    write_file(out / "object.init", "\n".join(init).encode())
+    _write_lines(out / "object.init", init)
     numbers = [*T[:3, 3], *_axis_angle(document["quaternion"])]
-    write_file(out / "object.pos", "".join(f"{x:.12g}\n" for x in numbers).encode())
+    _write_lines(out / "object.pos", (f"{x:.12g}" for x in numbers))
 
 
-def _pose_in_metres(document: Document, name: str) -> tuple[np.ndarray, float]:
+def _pose_in_metres(document: Document, name: str) -> tuple[Floats, float]:
     """(4, 4) of the pose in the camera, and the length of the mesh's unit in metres."""
     if document["translation"] is None:
         raise InvalidInputError(f"--format {name}: a pose without translation; give a camera")
@@ -123,7 +124,7 @@ def _pose_in_metres(document: Document, name: str) -> tuple[np.ndarray, float]:
     return T, metres
 
 
-def _axis_angle(quaternion: Sequence[float]) -> np.ndarray:
+def _axis_angle(quaternion: Sequence[float]) -> Floats:
     """(3,) axis x angle, the angle in radians, at most pi, of w, x, y, z."""
     w, *vector = quaternion
     sine = math.hypot(*vector)
@@ -131,14 +132,14 @@ def _axis_angle(quaternion: Sequence[float]) -> np.ndarray:
     return np.array(vector) * math.copysign(angle, w) / max(sine, 1e-300)
 
 
-def _pixels(points: np.ndarray, T: np.ndarray, K: Sequence[Sequence[float]]) -> np.ndarray:
+def _pixels(points: Floats, T: Floats, K: Sequence[Sequence[float]]) -> Floats:
     """(N, 2) pixels of points (N, 3)."""
     seen = (points @ T[:3, :3].T + T[:3, 3]) @ np.array(K).T
-    pixels: np.ndarray = seen[:, :2] / seen[:, 2:]
+    pixels: Floats = seen[:, :2] / seen[:, 2:]
     return pixels
 
 
-def _spread(points: np.ndarray, count: int) -> list[int]:
+def _spread(points: Floats, count: int) -> list[int]:
     """Indices of at most ``count`` points (N, 3), each as far as possible from those before it."""
     chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
     nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
@@ -163,7 +164,7 @@ def polygons_of(mesh: trimesh.Trimesh) -> list[list[int]]:
     return polygons
 
 
-def _outline(faces: np.ndarray) -> list[int] | None:
+def _outline(faces: Floats) -> list[int] | None:
     """The corners around triangles (F, 3) in their order; None if that is no single loop."""
     edges = {
         (int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)

@@ -129,16 +129,14 @@ def is_hidden(prim: Any) -> bool:
     if not image:
         return False
     is_helper = image.GetPurposeAttr().Get() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy)
-    now = Usd.TimeCode.EarliestTime()
-    return is_helper or image.GetVisibilityAttr().Get(now) == UsdGeom.Tokens.invisible
+    return is_helper or _first_value(image.GetVisibilityAttr()) == UsdGeom.Tokens.invisible
 
 
 def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | None:
     """A mesh: its arrays, and what is known of its materials; None without faces."""
-    now = Usd.TimeCode.EarliestTime()
-    points = np.array(mesh.GetPointsAttr().Get(now) or [], np.float64).reshape(-1, 3)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(now) or [], np.int64)
-    indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(now) or [], np.int64)
+    points = _array(mesh.GetPointsAttr(), np.float64).reshape(-1, 3)
+    counts = _array(mesh.GetFaceVertexCountsAttr())
+    indices = _array(mesh.GetFaceVertexIndicesAttr())
     if not len(counts):
         return None
     if counts.min() < 0 or counts.sum() != len(indices):
@@ -149,7 +147,6 @@ def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | N
     arrays[key + "points"] = points[used]
     arrays[key + "counts"] = counts
     arrays[key + "indices"] = own.reshape(-1)
-    holes = np.array(mesh.GetHoleIndicesAttr().Get(now) or [], np.int64)
     colour = _by_corner(UsdGeom.Gprim(mesh).GetDisplayColorPrimvar(), counts, indices, len(points))
     if colour is not None:
         arrays[key + "colour"] = colour.reshape(-1, 3)
@@ -159,8 +156,8 @@ def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | N
     bound = [(prim, None), *((g.GetPrim(), g) for g in UsdGeom.Subset.GetAllGeomSubsets(mesh))]
     for owner, subset in bound:
         material = UsdShade.MaterialBindingAPI(owner).ComputeBoundMaterial()[0]
-        faces = None if subset is None else np.array(subset.GetIndicesAttr().Get(now) or [])
-        if not material or (faces is not None and not faces.size):
+        faces = np.arange(len(counts)) if subset is None else _array(subset.GetIndicesAttr())
+        if not material or not faces.size:
             continue
         surface = _surface_of(material)
         name = surface.get("coordinates")
@@ -173,12 +170,22 @@ def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | N
         else:
             arrays[f"{key}uv{len(materials)}"] = uv.reshape(-1, 2)
         materials.append(surface)
-        of_face[slice(None) if faces is None else faces.astype(np.int64)] = len(materials)
-    of_face[holes] = -1
+        of_face[faces] = len(materials)
+    of_face[_array(mesh.GetHoleIndicesAttr())] = -1
     arrays[key + "material"] = of_face
-    is_left_handed = mesh.GetOrientationAttr().Get(now) == UsdGeom.Tokens.leftHanded
+    is_left_handed = _first_value(mesh.GetOrientationAttr()) == UsdGeom.Tokens.leftHanded
     triangles = int(np.maximum(counts - 2, 0).sum())
     return {"faces": triangles, "materials": materials, "left_handed": is_left_handed}
+
+
+def _first_value(attribute: Any) -> Any:
+    """The value of an attribute at the first frame; None without an attribute."""
+    return attribute.Get(Usd.TimeCode.EarliestTime()) if attribute else None
+
+
+def _array(attribute: Any, kind: Any = np.int64) -> Any:
+    values = _first_value(attribute)
+    return np.array([] if values is None else values, kind)
 
 
 def _by_corner(primvar: Any, counts: Any, indices: Any, vertices: int) -> Any:
@@ -186,8 +193,8 @@ def _by_corner(primvar: Any, counts: Any, indices: Any, vertices: int) -> Any:
     if not primvar or not primvar.HasValue():
         return None
     flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime())
-    values = None if flat is None else np.array(flat, np.float64)
-    if values is None or not len(values):
+    values = np.array([] if flat is None else flat, np.float64)
+    if not len(values):
         return None
     corners = len(indices)
     chosen = {
@@ -221,13 +228,12 @@ def _surface_of(material: Any) -> dict[str, Any]:
 def texture_of(shader: Any) -> dict[str, Any]:
     """The file of a texture, the factors of its colours, and the primvar of its coordinates."""
     file = value_of(shader.GetInput("file")) if shader else None
-    asset = file.Get() if file else None
+    asset = _first_value(file)
     if asset is None:
         return {"unread": True}
     found = {"texture": asset.path, **_place_of(file, asset), "coordinates": "st"}
     for name in ("scale", "bias"):
-        attribute = value_of(shader.GetInput(name))
-        value = attribute.Get() if attribute else None
+        value = _first_value(value_of(shader.GetInput(name)))
         if value is not None:
             found[name] = [float(v) for v in value][:3]
     coordinates = shader.GetInput("st")
@@ -236,9 +242,7 @@ def texture_of(shader: Any) -> dict[str, Any]:
         reader = UsdShade.Shader(source[0].source.GetPrim())
         if reader.GetIdAttr().Get() == "UsdTransform2d":
             return {"unread": True}
-        name = value_of(reader.GetInput("varname"))
-        value = name.Get() if name else None
-        found["coordinates"] = str(value or "st")
+        found["coordinates"] = str(_first_value(value_of(reader.GetInput("varname"))) or "st")
     return found
 
 
