@@ -23,7 +23,8 @@ from ..formats.pictures import (
 )
 from ..geometry.calibration import Camera
 from ..geometry.cameras import camera_matrix
-from ..utils.aliases import Array, Bytes, Fields, PathName, Size
+from ..utils.aliases import Fields, PathName, Size
+from ..utils.arrays import Array, Bytes
 from ..utils.checks import check_integer
 from ..utils.pictures import check_pixels, damaged_picture
 

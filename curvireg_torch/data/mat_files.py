@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import MAX_MAT_BYTES, InvalidInputError
-from ..utils.aliases import Floats
+from ..utils.arrays import Floats
 
 MatStruct = dict[str, "MatValue"]
 MatValue = list[MatStruct] | str | Floats | None

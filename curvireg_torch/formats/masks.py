@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import ImageError, InvalidInputError, MissingFileError
-from ..utils.aliases import Array, PathName, Singles
+from ..utils.aliases import PathName
+from ..utils.arrays import Array, Singles
 from ..utils.choices import listed
 from .boxes import PictureSize
 from .pictures import as_in_file, decoded, oriented

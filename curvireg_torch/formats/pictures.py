@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from ..errors import MAX_IMAGE_BYTES, CurviregError, ImageError, MissingFileError
-from ..utils.aliases import Array, Size
+from ..utils.aliases import Size
+from ..utils.arrays import Array
 from ..utils.pictures import check_pixels, damaged_picture
 from .boxes import PictureSize
 from .heif import open_photograph

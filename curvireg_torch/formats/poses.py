@@ -10,7 +10,8 @@ import numpy as np
 from trimesh.transformations import quaternion_matrix
 
 from ..errors import InvalidInputError, MissingFileError
-from ..utils.aliases import Document, Floats
+from ..utils.aliases import Document
+from ..utils.arrays import Floats
 from ..utils.choices import listed
 from ..utils.files import check_table_size, finite_numbers, split_name
 from .cameras.record import flattened, plain

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.aliases import Fields, Floats, Size
+from ..utils.aliases import Fields, Size
+from ..utils.arrays import Floats
 from ..utils.checks import (
     as_numbers,
     check_camera_matrix,

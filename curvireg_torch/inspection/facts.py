@@ -10,7 +10,8 @@ from scipy.spatial import ConvexHull, QhullError
 from ..matching.describe import VIEW_FACES
 from ..mesh import has_colours, mesh_unit, mesh_up, mesh_warnings
 from ..mesh.mesh import extreme_points, mesh_radius
-from ..utils.aliases import Fields, Floats
+from ..utils.aliases import Fields
+from ..utils.arrays import Floats
 from ..utils.choices import UNITS
 from .surface import POINTS, Symmetry, looks_inwards, measured_symmetries, thin_fraction
 

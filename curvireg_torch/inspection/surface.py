@@ -14,7 +14,8 @@ from ..mesh import has_colours, mesh_symmetries
 from ..mesh.colours import VARIED_BY, VARIED_FRACTION, colours_at, surface_colours
 from ..mesh.mesh import mesh_radius
 from ..rendering.embree import RayScene
-from ..utils.aliases import Fields, Floats, Integers
+from ..utils.aliases import Fields
+from ..utils.arrays import Floats, Integers
 
 POINTS = 2_000  # of the surface, of which samples consist
 DENSER = 20  # Times so many points that others are compared with

@@ -1,17 +1,8 @@
-"""Names of types that many signatures share."""
+"""Names of types that many signatures share; those of arrays are in :mod:`.arrays`."""
 
 from collections.abc import Mapping
 from os import PathLike
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[Any]
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Integers = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
 
 Fields = dict[str, Any]
 """Values by name, such as an object of JSON."""

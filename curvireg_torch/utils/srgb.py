@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .aliases import Floats
+from .arrays import Floats
 
 Colours = Floats
 

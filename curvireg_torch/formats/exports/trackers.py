@@ -8,7 +8,8 @@ import numpy as np
 import trimesh
 
 from ...errors import InvalidInputError
-from ...utils.aliases import Document, Floats
+from ...utils.aliases import Document
+from ...utils.arrays import Floats
 from ...utils.choices import UNITS
 from ...utils.files import write_file
 

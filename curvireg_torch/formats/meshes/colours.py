@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL.Image import Resampling
 
 from ...errors import MAX_IMAGE_PIXELS, MAX_TEXTURE_PIXELS
-from ...utils.aliases import Bytes, Floats, Singles
+from ...utils.arrays import Bytes, Floats, Singles
 from ...utils.pictures import PICTURE_STARTS, open_picture
 from ...utils.srgb import srgb
 

@@ -19,7 +19,8 @@ import numpy as np
 from trimesh.transformations import quaternion_matrix
 
 from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TABLE_BYTES
-from ...utils.aliases import Array, Bytes, Fields, Floats, Integers
+from ...utils.aliases import Fields
+from ...utils.arrays import Array, Bytes, Floats, Integers
 from ...utils.srgb import srgb
 from .colours import Painting, SurfaceColours, byte_colours
 from .limits import check_faces, check_parts

@@ -11,7 +11,7 @@ from itertools import takewhile
 
 import numpy as np
 
-from ...utils.aliases import Bytes, Floats, Integers
+from ...utils.arrays import Bytes, Floats, Integers
 from .colours import Painting, SurfaceColours, byte_colours
 from .limits import check_faces, check_lines, check_parts
 from .polygons import triangles_of_faces

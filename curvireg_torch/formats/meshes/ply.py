@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 
-from ...utils.aliases import Array, Bytes, Fields, Floats, Integers
+from ...utils.aliases import Fields
+from ...utils.arrays import Array, Bytes, Floats, Integers
 from .colours import Painting, SurfaceColours
 from .limits import check_lines
 from .polygons import triangles_of_faces

@@ -11,7 +11,7 @@ import mapbox_earcut
 import numpy as np
 
 from ...errors import MAX_POLYGON_WORK
-from ...utils.aliases import Array, Floats, Integers
+from ...utils.arrays import Array, Floats, Integers
 from .limits import check_faces
 
 Triangles = list[list[list[int]]]  # For each face its triangles, as positions among its corners

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TEXTURE_PIXELS
-from ...utils.aliases import Bytes, Floats, Integers
+from ...utils.arrays import Bytes, Floats, Integers
 from ...utils.choices import UNITS
 from .colours import SurfaceColours, texture_pixels
 

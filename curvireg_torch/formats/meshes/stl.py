@@ -8,7 +8,7 @@ import re
 
 import numpy as np
 
-from ...utils.aliases import Floats
+from ...utils.arrays import Floats
 from .source import MeshSource, ReadMesh, numbers, plain_text
 
 # Bytes before the faces of a binary file, and of each face

@@ -16,7 +16,7 @@ from io import BytesIO
 import numpy as np
 
 from ...errors import MAX_MESH_BYTES, MAX_MESH_FACES, MAX_MESH_PARTS
-from ...utils.aliases import Bytes, Floats
+from ...utils.arrays import Bytes, Floats
 from ..xml_files import check_xml
 from .colours import Painting, SurfaceColours
 from .limits import check_faces, check_parts

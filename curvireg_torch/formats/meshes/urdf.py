@@ -15,7 +15,8 @@ import trimesh
 from trimesh.transformations import euler_matrix
 
 from ...errors import MAX_TABLE_BYTES, MeshError
-from ...utils.aliases import Bytes, Fields, Floats
+from ...utils.aliases import Fields
+from ...utils.arrays import Bytes, Floats
 from ...utils.choices import UNITS
 from ..xml_files import read_xml
 from .colours import SurfaceColours, byte_colours

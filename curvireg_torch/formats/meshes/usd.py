@@ -18,7 +18,8 @@ from ...errors import (
     MAX_MESH_FACES,
     MAX_MESH_PARTS,
 )
-from ...utils.aliases import Array, Bytes, Fields, Integers
+from ...utils.aliases import Fields
+from ...utils.arrays import Array, Bytes, Integers
 from ...utils.programs import run_program
 from ...utils.srgb import srgb
 from .cad import bounded
