@@ -21,30 +21,40 @@ COLUMNS = "photo,camera," + ",".join((*rigs.ROTATION, *rigs.TRANSLATION))
 LINE = "1 PINHOLE 640 480 500 500 320 240"
 
 
-@pytest.mark.parametrize("name", ["a{blanks}b.png", "{blanks}", "a{blanks}", "a/{blanks}/b"])
-def test_names_of_colmap_with_blanks_are_read_in_linear_time(tmp_path, name):
+@pytest.fixture
+def images(tmp_path):
+    """Write photographs of COLMAP beside its camera."""
     (tmp_path / "cameras.txt").write_text(LINE)
+    return (tmp_path / "images.txt").write_text
 
+
+@pytest.fixture
+def rig(tmp_path):
+    """Write rows of a rig, beside its camera, and read it."""
+    (tmp_path / "cameras.txt").write_text(LINE)
+    return lambda header, row: read_rig(written(tmp_path / "rig.csv", header, row))
+
+
+@pytest.mark.parametrize("name", ["a{blanks}b.png", "{blanks}", "a{blanks}", "a/{blanks}/b"])
+def test_names_of_colmap_with_blanks_are_read_in_linear_time(tmp_path, images, name):
     def make(count):
         line = "1 1 0 0 0 0 0 1 1 " + name.format(blanks=" " * count)
-        (tmp_path / "images.txt").write_text(line)
+        images(line)
 
     check_linear(lambda _: read_rig(tmp_path, find=only_in(tmp_path)), make, 20_000)
 
 
-def test_numbers_of_colmap_are_read_in_linear_time(tmp_path):
-    (tmp_path / "cameras.txt").write_text(LINE)
+def test_numbers_of_colmap_are_read_in_linear_time(tmp_path, images):
     for line in ("1" * 9 + " {many}", "1 1 0 0 0 0 0 1 {many}", "{many} " * 9, "1 " * 7 + "{many}"):
 
         def make(count, line=line):
-            (tmp_path / "images.txt").write_text(line.format(many="1" * count))
+            images(line.format(many="1" * count))
 
         check_linear(lambda _: read_rig(tmp_path, find=only_in(tmp_path)), make, 100_000)
 
 
-def test_a_name_of_colmap_keeps_its_inner_blanks(tmp_path):
-    (tmp_path / "cameras.txt").write_text(LINE)
-    (tmp_path / "images.txt").write_text("  7  1 0 0 0   0 0 1  1   a  b.png \t\n\n")
+def test_a_name_of_colmap_keeps_its_inner_blanks(tmp_path, images):
+    images("  7  1 0 0 0   0 0 1  1   a  b.png \t\n\n")
     (view,) = read_rig(tmp_path)
     assert (view.name, view.photo) == ("image a  b.png", tmp_path / "a  b.png")
     for line in (
@@ -53,7 +63,7 @@ def test_a_name_of_colmap_keeps_its_inner_blanks(tmp_path):
         "x 1 0 0 0 0 0 1 1 a.png",
         "1 1 0 0 0 0 0 x 1 a.png",
     ):
-        (tmp_path / "images.txt").write_text(line)
+        images(line)
         with pytest.raises(InvalidInputError, match=r"images\.txt: expected IMAGE_ID QW"):
             read_rig(tmp_path)
 
@@ -137,11 +147,12 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("lines", LAYOUTS.values(), ids=LAYOUTS)
-def test_every_photograph_of_colmap_is_read_with_and_without_lines_of_points(tmp_path, lines):
-    (tmp_path / "cameras.txt").write_text(LINE)
-    (tmp_path / "images.txt").write_text("\n".join(lines))
+def test_every_photograph_of_colmap_is_read_with_and_without_lines_of_points(
+    tmp_path, images, lines
+):
+    images("\n".join(lines))
     assert [view.name for view in read_rig(tmp_path)] == [f"image {k}.png" for k in (1, 2, 3)]
-    (tmp_path / "images.txt").write_text("\n".join([IMAGE.format(1), "1 2 3.5", IMAGE.format(2)]))
+    images("\n".join([IMAGE.format(1), "1 2 3.5", IMAGE.format(2)]))
     with pytest.raises(InvalidInputError, match="expected IMAGE_ID"):
         read_rig(tmp_path)
 
@@ -162,40 +173,32 @@ def test_every_photograph_of_colmap_is_read_with_and_without_lines_of_points(tmp
         ),
     ],
 )
-def test_rows_of_a_rig_with_too_much_are_refused(tmp_path, header, row, message):
-    (tmp_path / "cameras.txt").write_text(LINE)
-    path = written(tmp_path / "rig.csv", header, row)
+def test_rows_of_a_rig_with_too_much_are_refused(rig, header, row, message):
     with pytest.raises(InvalidInputError, match=message):
-        read_rig(path)
+        rig(header, row)
 
 
 QUATERNION_COLUMNS = "photo,camera,qw,qx,qy,qz,tx,ty,tz"
 
 
-def test_a_quaternion_begins_with_its_real_part(tmp_path):
+def test_a_quaternion_begins_with_its_real_part(rig):
     """A quarter turn about z."""
-    (tmp_path / "cameras.txt").write_text(LINE)
     half = 0.5**0.5
     row = ["a.png", "cameras.txt", half, 0, 0, half, 4, 5, 6]
-    (view,) = read_rig(written(tmp_path / "rig.csv", QUATERNION_COLUMNS, row))
+    (view,) = rig(QUATERNION_COLUMNS, row)
     expected = torch.tensor([[0.0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]]).double()
     torch.testing.assert_close(view.T_cam_from_world, expected)
 
 
 @pytest.mark.parametrize("length", [0.98, 1.02])
-def test_quaternions_have_length_one(tmp_path, length):
-    (tmp_path / "cameras.txt").write_text(LINE)
+def test_quaternions_have_length_one(rig, length):
     row = ["a.png", "cameras.txt", length, 0, 0, 0, 4, 5, 6]
     with pytest.raises(InvalidInputError, match=f"of length 1, got {length}; check their order"):
-        read_rig(written(tmp_path / "rig.csv", QUATERNION_COLUMNS, row))
+        rig(QUATERNION_COLUMNS, row)
 
 
-def test_empty_cells_beyond_the_header_of_a_rig_do_not_count(tmp_path):
-    (tmp_path / "cameras.txt").write_text(LINE)
-    path = written(
-        tmp_path / "rig.csv", f"{COLUMNS},,", ["a.png", "cameras.txt", *POSE, "", " ", ""]
-    )
-    assert len(read_rig(path)) == 1
+def test_empty_cells_beyond_the_header_of_a_rig_do_not_count(rig):
+    assert len(rig(f"{COLUMNS},,", ["a.png", "cameras.txt", *POSE, "", " ", ""])) == 1
 
 
 K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
@@ -234,9 +237,8 @@ def test_cameras_of_bop_with_skew_are_refused(tmp_path, place):
         read_rig(tmp_path)
 
 
-def test_a_photograph_of_colmap_whose_name_is_a_number_is_no_line_of_points(tmp_path):
-    (tmp_path / "cameras.txt").write_text(LINE)
-    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 1 1 7\n2 1 0 0 0 0 0 1 1 8\n")
+def test_a_photograph_of_colmap_whose_name_is_a_number_is_no_line_of_points(tmp_path, images):
+    images("1 1 0 0 0 0 0 1 1 7\n2 1 0 0 0 0 0 1 1 8\n")
     assert [view.name for view in read_rig(tmp_path)] == ["image 7", "image 8"]
 
 

@@ -45,10 +45,11 @@ def test_the_header_of_a_binary_file_says_nothing(write, load, header, tail):
     assert not texts
 
 
-def test_faces_behind_the_last_one_are_named(write, load):
-    mesh, texts = load(write("a.stl", binary(claimed=5)))
-    assert len(mesh.faces) == 5
-    assert "it says 5 faces and holds 12: the others are left out" in texts[0]
+@pytest.mark.parametrize("claimed", [5, 11])
+def test_faces_behind_the_last_one_are_named(write, load, claimed):
+    mesh, texts = load(write("a.stl", binary(claimed=claimed)))
+    assert len(mesh.faces) == claimed
+    assert f"it says {claimed} faces and holds 12: the others are left out" in texts[0]
 
 
 def test_text_that_is_no_stl_is_not_taken_for_a_binary_file(refused):
@@ -58,6 +59,10 @@ def test_text_that_is_no_stl_is_not_taken_for_a_binary_file(refused):
 @pytest.mark.parametrize("cut", [1, 49, 50, 120, 599])
 def test_a_binary_file_that_is_cut_is_refused(refused, cut):
     refused("a.stl", binary()[:-cut], r"says 12 faces and holds .*cut while it was written")
+
+
+def test_a_binary_file_whose_number_of_faces_was_never_written_is_refused(refused):
+    refused("a.stl", binary(claimed=0), "says 0 faces and holds 12: it was cut")
 
 
 @pytest.mark.parametrize(
@@ -95,20 +100,17 @@ def test_ascii_files_of_every_encoding(write, load, content):
     assert not texts
 
 
-def test_an_ascii_file_that_is_cut_short_says_so(tmp_path, load):
+def test_an_ascii_file_that_is_cut_short_says_so(write, load):
     text = ascii_stl()
-    (tmp_path / "a.stl").write_text(text[: text.rindex("endsolid")])
-    mesh, texts = load(tmp_path / "a.stl")
+    mesh, texts = load(write("a.stl", text[: text.rindex("endsolid")]))
     check(mesh)
     assert "may have been cut short" in texts[0]
-    for end in ("endfacet", "endloop", "vertex", "facet normal"):
-        (tmp_path / "a.stl").write_text(
-            text[: text.rindex(end) + (4 if end == "facet normal" else 0)]
-        )
-        if end == "facet normal":
-            continue
-        with pytest.raises(MeshError, match="it was cut short, or is damaged"):
-            cr.load_mesh(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize("end", ["endfacet", "endloop", "vertex"])
+def test_an_ascii_file_that_is_cut_in_a_face_is_refused(refused, end):
+    text = ascii_stl()
+    refused("a.stl", text[: text.rindex(end)], "it was cut short, or is damaged")
 
 
 @pytest.mark.parametrize(
