@@ -277,10 +277,10 @@ def test_threemf_places_objects_and_their_components(tmp_path, load):
         '<component objectid="1" transform="0 1 0 -1 0 0 0 0 1 100 0 0"/><component objectid="1"/>'
     )
     resources = solid(1) + f'<object id="2"><components>{components}</components></object>'
-    items = '<item objectid="2" transform="1 0 0 0 1 0 0 0 1 0 0 5"/>'
+    items = '<item objectid="2" transform="1 0 0 0 0 1 0 -1 0 0 0 5"/>'
     mesh, texts = load(threemf(tmp_path / "a.3mf", resources, items))
     assert (mesh.units, mesh_up(mesh), len(mesh.faces), texts) == ("in", "z", 24, [])
-    np.testing.assert_allclose(mesh.bounds, [[-15, -15, 0], [110, 15, 10]])
+    np.testing.assert_allclose(mesh.bounds, [[-15, -5, -10], [110, 5, 20]])
     assert mesh.volume == pytest.approx(2 * 6000)
     with pytest.raises(MeshError, match="states its unit, in"):
         cr.load_mesh(tmp_path / "a.3mf", unit="mm")
