@@ -291,3 +291,10 @@ def test_matlab_counts_from_one_and_has_rows_first(tmp_path, read, matrix):
 )
 def test_cameras_that_are_not_read_say_how_to_write_them(tmp_path, content, words):
     check_refused(tmp_path, content, words)
+
+
+def test_a_camera_with_fx_is_none_of_metashape(tmp_path):
+    values = {"f": 1.0, "type": "frame", "fx": 500.0, "fy": 400.0, "cx": 320.0, "cy": 240.0}
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps(values))
+    assert load_camera(file).matrix.diagonal().tolist() == [500.0, 400.0, 1.0]

@@ -156,3 +156,15 @@ def test_a_mesh_without_any_colour_has_none(write):
         )
         is None
     )
+
+
+def test_colours_and_coordinates_stay_at_the_corners_of_a_mirrored_face():
+    painting = colours.Painting(1)
+    painting.corners[:] = [[[1, 0, 0], [2, 0, 0], [3, 0, 0]]]
+    texture = np.zeros((1, 1, 3), np.uint8)
+    painting.add_texture([0], texture, np.array([[[0.0, 0.1], [0.0, 0.2], [0.0, 0.3]]]))
+    mesh = source.ReadMesh(np.eye(3), np.array([[0, 1, 2]]), painting.finished())
+    mirrored = mesh.transformed(np.diag([-1.0, 1.0, 1.0, 1.0]))
+    assert mirrored.faces.tolist() == [[2, 1, 0]]
+    assert mirrored.colours.corners[0, :, 0].tolist() == [3, 2, 1]
+    np.testing.assert_allclose(mirrored.colours.uv[0, :, 1], [0.3, 0.2, 0.1])
