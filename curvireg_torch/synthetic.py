@@ -13,8 +13,9 @@ from .errors import InvalidInputError
 from .filters import gaussian_smooth
 from .geometry import camera_matrix, rotation_from_viewpoint
 from .geometry.cameras import rotation_towards, transform
-from .mesh import has_colours, mesh_centre, mesh_radius
+from .mesh import Mesh, as_mesh, mesh_centre, mesh_radius
 from .rendering import render_colour, render_depth
+from .utils.likes import MeshLike
 
 __all__ = [
     "DemoScene",
@@ -69,7 +70,7 @@ def example_mesh(*, painted: bool = False) -> trimesh.Trimesh:
 
 
 def random_pose(
-    mesh: trimesh.Trimesh,
+    mesh: Mesh | trimesh.Trimesh,
     camera_matrix: Tensor,
     size: tuple[int, int],
     generator: torch.Generator,
@@ -123,7 +124,7 @@ def procedural_background(size: tuple[int, int], generator: torch.Generator) -> 
 
 
 def synthesize_photograph(
-    mesh: trimesh.Trimesh,
+    mesh: MeshLike,
     T_cam_from_model: Tensor,
     camera_matrix: Tensor,
     size: tuple[int, int],
@@ -147,6 +148,7 @@ def synthesize_photograph(
         >>> image.shape, box.shape
         (torch.Size([3, 120, 160]), torch.Size([4]))
     """
+    mesh = as_mesh(mesh)
     H, W = size
     # Supersampling by two.
     K = (
@@ -168,10 +170,10 @@ def synthesize_photograph(
     rays = torch.stack([u, v, torch.ones_like(u)], dim=-1).double() @ torch.linalg.inv(K).T
     points = depth[high, wide, None] * rays
     surface = torch.zeros(2 * H, 2 * W, 3, dtype=torch.float64)
-    surface[high, wide] = _shades(mesh, T_cam_from_model, points, generator, texture)
+    surface[high, wide] = _shades(mesh.surface.scale, T_cam_from_model, points, generator, texture)
     coverage = F.avg_pool2d(mask[None, None].float(), 2)[0]
     front = F.avg_pool2d((surface * mask[..., None]).permute(2, 0, 1)[None].float(), 2)[0]
-    if has_colours(mesh):  # drawn before white
+    if mesh.has_colours:  # drawn before white
         front = (
             render_colour(mesh, T_cam_from_model, camera_matrix, size)[0] - (1.0 - coverage)
         ).clamp(min=0.0)
@@ -187,20 +189,20 @@ def synthesize_photograph(
 
 
 def _shades(
-    mesh: trimesh.Trimesh, T: Tensor, points: Tensor, generator: torch.Generator, texture: float
+    size: float, T: Tensor, points: Tensor, generator: torch.Generator, texture: float
 ) -> Tensor:
-    """(H, W, 3) colours of the mesh at neighbouring ``points`` (H, W, 3) in the camera, under
-    random light."""
+    """(H, W, 3) colours of a mesh of some ``size`` at neighbouring ``points`` (H, W, 3) in the
+    camera, under random light."""
     # Normals come from neighbouring points; at occluding contours they point to the camera.
     dv, du = torch.gradient(points, dim=(0, 1))
     normal = F.normalize(torch.linalg.cross(dv, du), dim=-1)
-    border = torch.maximum(du[..., 2].abs(), dv[..., 2].abs()) > 0.2 * mesh.scale
+    border = torch.maximum(du[..., 2].abs(), dv[..., 2].abs()) > 0.2 * size
     normal[border] = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
     light = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
     # from above, in front
     light = F.normalize(light + torch.tensor([0.0, -0.8, -1.2], dtype=torch.float64), dim=0)
     shade = 0.35 + 0.65 * (normal @ light).clamp(min=0)
-    model = (points - T[:3, 3]) @ T[:3, :3] / (0.5 * mesh.scale)
+    model = (points - T[:3, 3]) @ T[:3, :3] / (0.5 * size)
     waves = torch.randn(3, 4, generator=generator, dtype=torch.float64) * 6
     phases = 6.3 * torch.rand(4, generator=generator, dtype=torch.float64)
     pattern = torch.sin(model @ waves + phases).mean(dim=-1)

@@ -16,7 +16,7 @@ from curvireg_torch.data.images import read_photo
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError, MeshError
 from curvireg_torch.jobs.lists import find_photographs, read_list
 from curvireg_torch.jobs.options import RegisterOptions
-from curvireg_torch.mesh import has_colours, mesh_symmetries, mesh_warnings
+from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.registration.photograph import FRACTIONS, as_photographs
 from curvireg_torch.registration.refinement import why_outside
 from curvireg_torch.utils.extras import is_installed
@@ -131,11 +131,11 @@ def loaded(path, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CurviregWarning)
         mesh = cr.load_mesh(path, **options)
-    return mesh, "; ".join(warning.text for warning in mesh_warnings(mesh))
+    return mesh, "; ".join(warning.text for warning in mesh.warnings)
 
 
 def colours_of(mesh):
-    colours = mesh.metadata.get("colours")
+    colours = mesh.colours
     return set() if colours is None else set(map(tuple, colours.corners.reshape(-1, 3).tolist()))
 
 
@@ -165,7 +165,7 @@ def test_meshes_have_all_their_faces_and_colours(name, colours):
     folder, _, file = name.partition("/")
     mesh, texts = loaded(real_case(folder) / file)
     assert (sorted(mesh.extents.tolist()), len(mesh.faces)) == ([1.0, 2.0, 3.0], 12)
-    assert abs(mesh.volume) == pytest.approx(6.0)
+    assert abs(mesh.surface.volume) == pytest.approx(6.0)
     assert colours_of(mesh) == colours
     assert texts == ""
 
@@ -179,13 +179,13 @@ def test_fans_and_strips_have_all_their_faces(name, expected):
     mesh, texts = loaded(real_case("m08-gltf-triangle-fan") / f"{name}.gltf")
     count, area = expected
     assert (len(mesh.faces), texts) == (count, "")
-    assert mesh.area == pytest.approx(area)
+    assert mesh.surface.area == pytest.approx(area)
 
 
 def test_three_boxes_in_one_obj():
     mesh, texts = loaded(real_case("m02-obj-interleaved-negative") / "a.obj")
     assert (len(mesh.vertices), len(mesh.faces), texts) == (24, 36, "")
-    assert len(mesh.split(only_watertight=True)) == 3
+    assert len(mesh.surface.split(only_watertight=True)) == 3
 
 
 @pytest.mark.parametrize(
@@ -217,15 +217,15 @@ def write_can(folder, library):
 def test_textures_behind_options_and_in_other_folders(tmp_path):
     behind = shutil.copytree(real_case("m09-mtl-options"), tmp_path / "options")
     mesh, texts = loaded(write_can(behind, "can.mtl"))
-    assert (has_colours(mesh), texts) == (True, "")
+    assert (mesh.has_colours, texts) == (True, "")
     beside = shutil.copytree(real_case("m11-mtl-parent-folder"), tmp_path / "parent")
     mesh, texts = loaded(write_can(beside / "models", "image.mtl"))
-    assert not has_colours(mesh)
+    assert not mesh.has_colours
     assert (
         "../images/label.png lies outside of its folder and is left out; name its folder" in texts
     )
     mesh, texts = loaded(beside / "models" / "can.obj", textures=beside / "images")
-    assert (has_colours(mesh), texts) == (True, "")
+    assert (mesh.has_colours, texts) == (True, "")
     for library, lost in (("../can.mtl", "can.mtl lies outside"), ("image.mtl", "label.png")):
         assert lost in loaded(write_can(beside / "models", library))[1]
 
@@ -236,9 +236,9 @@ def test_plain_materials_and_coordinates_without_a_texture_are_no_print():
     assert len(mesh_symmetries(plain)) == len(mesh_symmetries(bare)) == 72
     for name, is_lost in (("kd", False), ("lost", True), ("uv", False)):
         mesh, texts = loaded(real_case("m23-uv-without-material") / f"{name}.obj", unit="mm")
-        assert not has_colours(mesh)
+        assert not mesh.has_colours
         assert ("missing beside it" in texts) == is_lost
-    assert not has_colours(plain)
+    assert not plain.has_colours
 
 
 def test_meshes_far_away_and_with_stray_geometry_warn(tmp_path):
@@ -291,7 +291,7 @@ def test_a_photograph_of_a_phone_and_a_step_file_know_camera_and_unit():
     if not is_installed("cascadio") or not is_installed("pi_heif"):
         pytest.skip("cascadio or pi-heif is not installed")
     mesh, _ = loaded(folder / "flange.step")
-    assert mesh.units == "mm"
+    assert mesh.unit == "mm"
     photo = read_photo(folder / "photo.heic")
     camera = photo.camera()
     assert camera.source == "exif"
@@ -332,7 +332,7 @@ def test_concave_faces_have_the_area_of_their_polygons():
     path = real_case("n40-concave-faces") / "plate.obj"
     mesh, texts = loaded(path, unit="mm")
     assert texts == ""
-    assert mesh.area == pytest.approx(area_of_polygons(path))
+    assert mesh.surface.area == pytest.approx(area_of_polygons(path))
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply"])
@@ -340,7 +340,7 @@ def test_colours_of_which_one_is_above_one(suffix):
     mesh, texts = loaded(real_case("n41-colours-above-one") / f"lamp.{suffix}", unit="mm")
     expected, _ = loaded(real_case("lamp") / "lamp_colours.obj", unit="mm")
     assert texts == ""
-    assert has_colours(mesh)
+    assert mesh.has_colours
     assert len(colours_of(mesh)) > 1
     assert colours_of(mesh) >= {(60, 60, 70)}
     np.testing.assert_allclose(mesh.extents, expected.extents, atol=1e-3)
@@ -365,7 +365,7 @@ def test_meshes_of_a_ros_package_are_found():
     package = real_case("n48-urdf-of-a-package") / "lamp_description"
     mesh, texts = loaded(package / "urdf" / "lamp.urdf")
     expected, _ = loaded(real_case("lamp") / "lamp.stl", unit="mm")
-    assert (mesh.units, texts) == ("m", "")
+    assert (mesh.unit, texts) == ("m", "")
     np.testing.assert_allclose(mesh.bounds, 1e-3 * expected.bounds, atol=1e-6)
 
 

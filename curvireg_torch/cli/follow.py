@@ -271,7 +271,6 @@ def _poses(
     from ..geometry import Camera, undistorted
     from ..jobs.entry import start_in_unit
     from ..jobs.options import prior_from_limits
-    from ..mesh.mesh import mesh_unit
     from ..registration import FailedRegistration, Follower
 
     follow = None
@@ -295,7 +294,7 @@ def _poses(
             if follow is None:
                 follow = Follower(registrar, _camera(options, image), prior=prior)
                 if (start := options.read_start()) is not None:
-                    pose = start_in_unit(start, mesh_unit(registrar.bank.mesh))
+                    pose = start_in_unit(start, registrar.bank.mesh.unit)
                     follow.start(
                         image,
                         pose,

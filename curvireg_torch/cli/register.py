@@ -341,7 +341,6 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     from ..jobs.entry import entry_of, observe
     from ..jobs.photograph import register_observation
     from ..jobs.result_files import write_lost
-    from ..mesh import mesh_up
     from ..visualization.words import camera_in_words
 
     out = arguments.out
@@ -373,7 +372,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
             "photograph"
         )
     if not found.reliable and options.pose == "upright" and options.up is None:
-        axis = mesh_up(found.registrar.of_mesh(found.mesh_index).bank.mesh)
+        axis = found.registrar.of_mesh(found.mesh_index).bank.mesh.up
         remarks.append(f"--pose upright: {axis} of the mesh is taken as up; --up names another")
     if remarks:  # with --json, standard output holds only the result
         print(f"{path}: {'; '.join(remarks)}", file=sys.stderr if arguments.json else sys.stdout)

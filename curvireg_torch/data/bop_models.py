@@ -72,7 +72,7 @@ class BOPModels:
             except CurviregError:  # reported when the model is needed
                 return None
         try:
-            vertices = mesh.convex_hull.vertices
+            vertices = mesh.surface.convex_hull.vertices
         except RuntimeError:  # flat
             vertices = mesh.vertices
         return torch.from_numpy(np.array(vertices, dtype=np.float64))

@@ -8,11 +8,12 @@ import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
 from ..matching.describe import VIEW_FACES
-from ..mesh import has_colours, mesh_unit, mesh_up, mesh_warnings
-from ..mesh.mesh import extreme_points, mesh_radius
+from ..mesh import as_mesh, mesh_radius
+from ..mesh.mesh import extreme_points
 from ..utils.aliases import Fields
 from ..utils.arrays import Floats
 from ..utils.choices import UNITS
+from ..utils.likes import MeshLike
 from .surface import POINTS, Symmetry, looks_inwards, measured_symmetries, thin_fraction
 
 # From which simplification is advised: reading and the first bank take longer than a photograph
@@ -107,20 +108,22 @@ def _flat_hull_area(points: Floats) -> float:
         return 0.0
 
 
-def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
-    """Examine a clean mesh (:func:`curvireg_torch.load_mesh`).
+def mesh_facts(mesh: MeshLike) -> MeshFacts:
+    """Examine a mesh.
 
     Example:
         >>> facts = mesh_facts(trimesh.creation.box((1, 2, 3)))
         >>> facts.faces, facts.is_watertight, len(facts.symmetries)
         (12, True, 3)
     """
-    unit = mesh_unit(mesh)
+    mesh = as_mesh(mesh)
+    surface = mesh.surface
+    unit = mesh.unit
     extents = np.ptp(mesh.vertices, axis=0)
     points = extreme_points(mesh).numpy()
     hull = _convex_hull(points)
     hull_area = _flat_hull_area(points) if hull is None else float(hull.area)
-    area_of_hull = float(mesh.area / max(hull_area, 1e-300))
+    area_of_hull = float(surface.area / max(hull_area, 1e-300))
     welded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     welded.merge_vertices()  # files such as STL repeat the corners of each face
     rows = np.sort(welded.faces, axis=1)
@@ -131,8 +134,8 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
     part = corners[welded.faces[:, 0]]
     parts = len(np.unique(part))
     symmetries = measured_symmetries(mesh)
-    is_coloured = has_colours(mesh)
-    warnings = [warning.text for warning in mesh_warnings(mesh)]
+    is_coloured = mesh.has_colours
+    warnings = [warning.text for warning in mesh.warnings]
     warnings += _size_warnings(float(np.linalg.norm(extents)), unit)
     if len(mesh.faces) > MANY_FACES:
         warnings.append(
@@ -156,15 +159,15 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
     verdicts = []
     if extents.min() < THIN * extents.max():
         verdicts.append("thin: its pose is uncertain where it is seen from the edge")
-    thin = thin_fraction(mesh, part)
+    thin = thin_fraction(surface, part)
     if thin > MUCH_THIN:
         verdicts.append(
             f"{100 * thin:.0f} % of its surface is of parts thinner than 1 % of its size: they "
             f"cover few pixels"
         )
-    is_sphere = _is_sphere(mesh)
+    is_sphere = _is_sphere(surface)
     is_large = unit is not None and float(np.linalg.norm(extents)) * UNITS[unit] > ROOM
-    is_room = is_large and hull is not None and looks_inwards(mesh, hull)
+    is_room = is_large and hull is not None and looks_inwards(surface, hull)
     is_wire = area_of_hull < WIRE_AREA
     if is_sphere and not is_coloured:
         verdicts.append(
@@ -192,7 +195,7 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
         area_of_hull=area_of_hull,
         is_coloured=is_coloured,
         symmetries=symmetries,
-        up=mesh_up(mesh),
+        up=mesh.up,
         verdicts=tuple(verdicts),
         warnings=(*warnings, *verdicts),
         is_hopeless=is_room or is_wire or (is_sphere and not is_coloured),

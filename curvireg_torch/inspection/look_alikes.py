@@ -12,7 +12,6 @@ from ..geometry import uniform_views, viewpoint_from_rotation
 from ..geometry.conversions import axis_angle_from_rotation, rotation_from_axis_angle
 from ..geometry.viewpoint import angles_between, up_rotation
 from ..matching import ViewBank, ViewDescriber
-from ..mesh import mesh_up
 from ..utils.aliases import Fields
 
 LOOKED_AT = 48  # Directions from which the mesh is looked at
@@ -113,7 +112,7 @@ def look_alikes(
         report_progress: called with directions done and in all.
     """
     directions = uniform_views(LOOKED_AT).rotations.double()
-    up = up_rotation(mesh_up(bank.mesh)).double()
+    up = up_rotation(bank.mesh.up).double()
     elevation = viewpoint_from_rotation(directions @ up.mT)[1]
     directions = directions[(elevation >= elevations[0]) & (elevation <= elevations[1])]
     distance = bank.distances.median().double().cpu()

@@ -2,7 +2,8 @@
 a box that is not exact."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,11 +17,11 @@ from ..geometry import camera_matrix
 from ..geometry.cameras import point_in_cameras, pose_around, transform
 from ..geometry.viewpoint import up_rotation
 from ..matching.describe import view_mesh
-from ..mesh import has_colours, mesh_centre, mesh_radius, mesh_up
-from ..mesh.colours import colours_at, surface_colours
+from ..mesh import Mesh, SurfaceColours, as_mesh, mesh_centre, mesh_radius
+from ..mesh.colours import colours_at
 from ..mesh.edges import simplified
-from ..mesh.mesh import cached_in_mesh
 from ..synthetic import procedural_background, random_pose, synthesize_photograph
+from ..utils.likes import MeshLike
 from .facts import MANY_FACES
 
 SIZE = (480, 640)  # of the photographs, H, W
@@ -86,15 +87,20 @@ class PhotographGenerator:
         torch.Size([3, 480, 640])
     """
 
-    mesh: trimesh.Trimesh
+    mesh: MeshLike
     seed: int
     upright: bool = False
     backgrounds: Sequence[Tensor] = ()
     clutter: bool = False
 
+    @cached_property
+    def subject(self) -> Mesh:
+        """The mesh as it is photographed."""
+        return photographed_mesh(as_mesh(self.mesh))
+
     def __call__(self, index: int) -> GeneratedPhotograph:
         """Photograph number ``index``."""
-        mesh = photographed_mesh(self.mesh)
+        mesh = self.subject
         generator = torch.Generator().manual_seed(1_000_003 * self.seed + index)
         # of its own: clutter changes nothing else
         others = torch.Generator().manual_seed(1_000_033 * self.seed + index)
@@ -120,45 +126,36 @@ def trial_camera() -> Tensor:
     return camera_matrix(FOCAL, FOCAL, 0.5 * (width - 1), 0.5 * (height - 1), dtype=torch.float64)
 
 
-@cached_in_mesh
-def photographed_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def photographed_mesh(mesh: Mesh) -> Mesh:
     """The mesh, or a simplified one in its place if it has many faces: preparing millions of them
     for each photograph would take longer than to register it."""
     if len(mesh.faces) <= MANY_FACES:
         return mesh
-    colours = surface_colours(mesh)
-    if colours is None or not has_colours(mesh):
-        return view_mesh(mesh)
+    if mesh.colours is None or not mesh.has_colours:
+        return replace(mesh, surface=view_mesh(mesh), colours=None)
     centre = mesh_centre(mesh).numpy()
     vertices, faces = simplified(mesh, centre, COLOURED_FACES)
-    simple = trimesh.Trimesh(vertices + centre, faces, process=False)
-    points, owners = trimesh.sample.sample_surface(mesh, COLOURED_POINTS, seed=0)
-    weights = trimesh.triangles.points_to_barycentric(mesh.triangles[owners], points)
-    seen = colours_at(colours, owners, *weights[:, 1:].T)
-    nearest = cKDTree(points).query(simple.vertices)[1]
-    simple.visual.vertex_colors = (255.0 * seen[nearest]).round().astype(np.uint8)
-    simple.units = mesh.units
-    simple.metadata["up"] = mesh_up(mesh)
-    return simple
+    vertices += centre
+    points, owners = trimesh.sample.sample_surface(mesh.surface, COLOURED_POINTS, seed=0)
+    corners = mesh.surface.triangles[owners]
+    weights = trimesh.triangles.points_to_barycentric(corners, points)
+    seen = colours_at(mesh.colours, owners, *weights[:, 1:].T)
+    nearest = cKDTree(points).query(vertices)[1]
+    pixels = (255.0 * seen[nearest]).round().astype(np.uint8)
+    colours = replace(SurfaceColours.plain(len(faces)), corners=pixels[faces])
+    surface = trimesh.Trimesh(vertices, faces, process=False)
+    return replace(mesh, surface=surface, colours=colours)
 
 
-def without_colours(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A copy of a mesh in no colour."""
-    grey = mesh.copy()
-    grey.visual = trimesh.visual.ColorVisuals()
-    grey.metadata.pop("colours", None)
-    return grey
-
-
-def with_print(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A copy of a mesh with patches of random colours, as if its print were known.
+def with_print(mesh: MeshLike) -> Mesh:
+    """A mesh with patches of random colours, as if its print were known.
 
     Example:
-        >>> has_colours(with_print(trimesh.creation.box((1, 2, 3))))
+        >>> with_print(trimesh.creation.box((1, 2, 3))).has_colours
         True
     """
-    whole = photographed_mesh(without_colours(mesh))
-    size = 2.0 * mesh_radius(mesh)
+    whole = photographed_mesh(replace(as_mesh(mesh), colours=None))
+    size = 2.0 * mesh_radius(whole)
     vertices, faces = trimesh.remesh.subdivide_to_size(
         whole.vertices, whole.faces, PATCH_EDGE * size, max_iter=PATCH_STEPS
     )
@@ -168,10 +165,9 @@ def with_print(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     seeds = rng.uniform(middles.min(axis=0), middles.max(axis=0), (PATCHES, 3))
     colours = rng.integers(20, 235, (PATCHES, 3)).astype(np.uint8)
     patch = cKDTree(seeds).query(middles)[1]
-    printed.visual.face_colors = colours[patch]
-    printed.units = mesh.units
-    printed.metadata["up"] = mesh_up(mesh)
-    return printed
+    corners = np.repeat(colours[patch][:, None], 3, axis=1)
+    colours_of_faces = replace(SurfaceColours.plain(len(faces)), corners=corners)
+    return replace(whole, surface=printed, colours=colours_of_faces)
 
 
 def to_bytes(image: Tensor) -> Tensor:
@@ -179,7 +175,7 @@ def to_bytes(image: Tensor) -> Tensor:
     return (255.0 * image).round().to(torch.uint8)
 
 
-def _random_truth(mesh: trimesh.Trimesh, generator: torch.Generator, *, upright: bool) -> Tensor:
+def _random_truth(mesh: Mesh, generator: torch.Generator, *, upright: bool) -> Tensor:
     """A (4, 4) pose that shows the mesh; seen from everywhere and rolled, unless it is upright."""
     elevations = UPRIGHT if upright else (-90.0, 90.0)
     T = random_pose(mesh, trial_camera(), SIZE, generator, elevations=elevations, fill=FILL)
@@ -188,8 +184,8 @@ def _random_truth(mesh: trimesh.Trimesh, generator: torch.Generator, *, upright:
     R = T[:3, :3]
     if not upright:
         R = _random_rotation(generator)
-    elif mesh_up(mesh) != "z":
-        R = R @ up_rotation(mesh_up(mesh)).double()
+    elif mesh.up != "z":
+        R = R @ up_rotation(mesh.up).double()
     return pose_around(R, position, centre)
 
 
@@ -226,7 +222,7 @@ def _random_object(radius: float, generator: torch.Generator) -> trimesh.Trimesh
 
 
 def _with_objects_behind(
-    background: Tensor, mesh: trimesh.Trimesh, truth: Tensor, generator: torch.Generator
+    background: Tensor, mesh: Mesh, truth: Tensor, generator: torch.Generator
 ) -> Tensor:
     """The background with up to six objects beside and behind the object, as far away as its
     centre or farther."""
@@ -245,7 +241,7 @@ def _with_objects_behind(
 
 
 def _with_object_in_front(
-    image: Tensor, box: Tensor, mesh: trimesh.Trimesh, truth: Tensor, generator: torch.Generator
+    image: Tensor, box: Tensor, mesh: Mesh, truth: Tensor, generator: torch.Generator
 ) -> Tensor:
     """The photograph with something before a side or corner of the object's box, of which it covers
     less than a third."""

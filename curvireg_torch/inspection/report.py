@@ -8,13 +8,11 @@ from functools import partial
 from typing import Any
 
 import torch
-import trimesh
 from torch import Tensor
 
 from ..data import read_image
 from ..matching import cached_bank
-from ..mesh import has_colours
-from ..mesh.mesh import as_mesh
+from ..mesh import as_mesh
 from ..pipeline import Pipeline
 from ..registration import Registrar
 from ..utils.aliases import Fields
@@ -201,7 +199,7 @@ def inspect(
     report = progress or report_nothing
     registrar = mesh if isinstance(mesh, Registrar) else None
     report("mesh", 0, 1)
-    clean: trimesh.Trimesh = as_mesh(mesh) if registrar is None else registrar.bank.mesh
+    clean = as_mesh(mesh) if not isinstance(mesh, Registrar) else mesh.bank.mesh
     facts = mesh_facts(clean)
     report("mesh", 1, 1)
     found = Inspection(facts, seed=seed, with_camera=with_camera, clutter=clutter)
@@ -233,7 +231,7 @@ def look_alikes_of(
     return look_alikes(
         registrar.bank,
         registrar.describer,
-        None if has_colours(mesh) else registrar.symmetries_of(exact=True),
+        None if mesh.has_colours else registrar.symmetries_of(exact=True),
         elevations=UPRIGHT if upright else (-90.0, 90.0),
         report_progress=report_progress,
     )

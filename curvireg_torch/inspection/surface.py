@@ -10,12 +10,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..geometry import rotation_error
-from ..mesh import has_colours, mesh_symmetries
-from ..mesh.colours import VARIED_BY, VARIED_FRACTION, colours_at, surface_colours
+from ..mesh import Mesh, as_mesh, mesh_symmetries
+from ..mesh.colours import VARIED_BY, VARIED_FRACTION, colours_at
 from ..mesh.mesh import mesh_radius
 from ..rendering.embree import RayScene
 from ..utils.aliases import Fields
 from ..utils.arrays import Floats, Integers
+from ..utils.likes import MeshLike
 
 POINTS = 2_000  # of the surface, of which samples consist
 DENSER = 20  # Times so many points that others are compared with
@@ -60,7 +61,7 @@ class Symmetry:
         }
 
 
-def measured_symmetries(mesh: trimesh.Trimesh) -> tuple[Symmetry, ...]:
+def measured_symmetries(mesh: Mesh) -> tuple[Symmetry, ...]:
     """Rotations but the identity that leave the shape as it is, how exactly they do, and whether
     they leave the colours."""
     transforms = mesh_symmetries(mesh)
@@ -74,7 +75,7 @@ def measured_symmetries(mesh: trimesh.Trimesh) -> tuple[Symmetry, ...]:
     )
 
 
-def look_symmetries(mesh: trimesh.Trimesh) -> Tensor:
+def look_symmetries(mesh: MeshLike) -> Tensor:
     """(S, 4, 4) rotations of a mesh that leave its shape and its colours as they are, the identity
     first.
 
@@ -82,23 +83,23 @@ def look_symmetries(mesh: trimesh.Trimesh) -> Tensor:
         >>> look_symmetries(trimesh.creation.box((1, 2, 3))).shape
         torch.Size([4, 4, 4])
     """
-    same = [each.transform for each in measured_symmetries(mesh) if each.has_same_colours]
+    same = [each.transform for each in measured_symmetries(as_mesh(mesh)) if each.has_same_colours]
     return torch.stack([torch.eye(4, dtype=torch.float64), *same])
 
 
 class _ColouredPoints:
     """Points of a mesh's surface, and their colours if these vary."""
 
-    def __init__(self, mesh: trimesh.Trimesh) -> None:
-        self.points, faces = trimesh.sample.sample_surface(mesh, DENSER * POINTS, seed=0)
+    def __init__(self, mesh: Mesh) -> None:
+        self.points, faces = trimesh.sample.sample_surface(mesh.surface, DENSER * POINTS, seed=0)
         self.tree = cKDTree(self.points)
         self.diameter = 2.0 * mesh_radius(mesh)
         self.some = self.points[::DENSER]
         self.colours = None
-        found = surface_colours(mesh)
-        if found is not None and has_colours(mesh):
-            weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], self.points)
-            self.colours = colours_at(found, faces, *weights[:, 1:].T)
+        if mesh.colours is not None and mesh.has_colours:
+            corners = mesh.surface.triangles[faces]
+            weights = trimesh.triangles.points_to_barycentric(corners, self.points)
+            self.colours = colours_at(mesh.colours, faces, *weights[:, 1:].T)
         # of points on one and the same surface
         distance, nearest = self.tree.query(self.some, k=2)
         self.spacing = float(distance[:, 1].mean())

@@ -6,11 +6,11 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import torch
 import torch.nn.functional as F
-import trimesh
 from scipy.stats import binomtest
 from torch import Tensor
 
@@ -20,7 +20,7 @@ from ..geometry import PosePrior, rotation_from_axis_angle, viewpoint_from_rotat
 from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.viewpoint import up_rotation
 from ..matching import cached_bank
-from ..mesh import has_colours, mesh_centre, mesh_up
+from ..mesh import Mesh, mesh_centre
 from ..registration import Registrar, Registration
 from ..synthetic import synthesize_photograph
 from ..utils.aliases import Fields
@@ -29,10 +29,8 @@ from .photographs import (
     SIZE,
     GeneratedPhotograph,
     PhotographGenerator,
-    photographed_mesh,
     to_bytes,
     with_print,
-    without_colours,
 )
 from .surface import look_symmetries
 
@@ -214,7 +212,7 @@ class _Setup:
     symmetries: Tensor
 
     @property
-    def mesh(self) -> trimesh.Trimesh:
+    def mesh(self) -> Mesh:
         return self.registrar.bank.mesh
 
     def register(
@@ -232,17 +230,16 @@ class _Setup:
         rotation = rotation_from_axis_angle(angle * axis) @ photograph.truth[:3, :3]
         return self.register(photograph, prior=PosePrior(rotation=rotation, within=HINT_DEGREES))
 
-    def register_with_second(self, photograph: GeneratedPhotograph) -> Outcome:
-        """The outcome of a photograph and a second one, of a camera to its side."""
+    def register_with_second(self, photograph: GeneratedPhotograph, subject: Mesh) -> Outcome:
+        """The outcome of a photograph and a second one of the ``subject``, from beside it."""
         K = photograph.camera
         turn = rotation_from_axis_angle(
             torch.tensor([0.0, math.radians(SECOND_CAMERA), 0.0], dtype=torch.float64)
         )
         centre = point_in_cameras(photograph.truth, mesh_centre(self.mesh))
         move = pose_around(turn, centre, centre)
-        mesh = photographed_mesh(self.mesh)
         generator = _generator(photograph)
-        image, box = synthesize_photograph(mesh, move @ photograph.truth, K, SIZE, generator)
+        image, box = synthesize_photograph(subject, move @ photograph.truth, K, SIZE, generator)
         images = [photograph.image, to_bytes(image)]
         boxes = torch.stack([photograph.box, box])
         cameras = torch.stack([torch.eye(4, dtype=torch.float64), move])
@@ -278,11 +275,14 @@ def _conditions(setup: _Setup, generate: PhotographGenerator, report: Report) ->
     conditions = [
         _Condition("without a camera" if is_known else "with a camera", other.register),
         _Condition(f"with a pose prior within {HINT_DEGREES:g} degrees", setup.register_with_hint),
-        _Condition("with a second photograph from another side", setup.register_with_second),
+        _Condition(
+            "with a second photograph from another side",
+            partial(setup.register_with_second, subject=generate.subject),
+        ),
     ]
-    if has_colours(setup.mesh):
+    if setup.mesh.has_colours:
         plain = replace(
-            setup, registrar=_like(setup.registrar, without_colours(setup.mesh), report)
+            setup, registrar=_like(setup.registrar, replace(setup.mesh, colours=None), report)
         )
         return [*conditions, _Condition("without the mesh's colours", plain.register)]
     printed = with_print(setup.mesh)
@@ -307,16 +307,16 @@ def _symmetries(registrar: Registrar) -> Tensor:
     return transforms[:, :3, :3].double()
 
 
-def _like(registrar: Registrar, mesh: trimesh.Trimesh, report: Report) -> Registrar:
+def _like(registrar: Registrar, mesh: Mesh, report: Report) -> Registrar:
     """A registrar of another mesh with the same settings."""
     bank = registrar.bank
     other = cached_bank(mesh, pipeline=registrar.pipeline, device=bank.device, progress=report)
     return Registrar(other, mesh_is="exact")
 
 
-def _viewpoint_of(mesh: trimesh.Trimesh, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _viewpoint_of(mesh: Mesh, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Azimuth, elevation and theta of rotations (..., 3, 3) from the mesh's axes, z up."""
-    return viewpoint_from_rotation(rotation @ up_rotation(mesh_up(mesh)).double().mT)
+    return viewpoint_from_rotation(rotation @ up_rotation(mesh.up).double().mT)
 
 
 def _generator(photograph: GeneratedPhotograph) -> torch.Generator:

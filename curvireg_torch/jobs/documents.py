@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from ..mesh.mesh import mesh_unit
 from ..registration.result import Detection, Registration
 from ..registration.target import Target
 from ..version import __version__
@@ -43,7 +42,7 @@ def result_document(
     symmetries = target.symmetries_of(exact=target.is_exact)
     return {
         "schema": SCHEMA,
-        "unit": mesh_unit(bank.mesh),
+        "unit": bank.mesh.unit,
         "bank_views": len(bank),
         **result.to_dict(),
         "symmetries": 1 if symmetries is None else len(symmetries),

@@ -70,11 +70,10 @@ def load_bank(path: Path, *, unit: str | None, up: str | None) -> "ViewBank":
     """The bank of a file; refuses a unit or an axis that is not that of its mesh, unless it is
     None."""
     from ..matching import ViewBank
-    from ..mesh.mesh import mesh_unit, mesh_up
 
     bank = ViewBank.load(path)
-    built_unit = mesh_unit(bank.mesh)
-    built_up = mesh_up(bank.mesh)
+    built_unit = bank.mesh.unit
+    built_up = bank.mesh.up
     if unit not in (None, built_unit):
         built = f"with unit {built_unit}" if built_unit else "without a unit"
         message = f"built {built}, not {unit}; leave the unit out, or build it again"

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from ..formats.boxes.files import Corners
     from ..geometry import Camera
     from ..geometry.pose_prior import PosePrior
+    from ..mesh import Mesh
     from ..pipeline import Pipeline
 
 CAMERA_OPTIONS = "--camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov DEG"
@@ -280,7 +281,7 @@ class RegisterOptions:
         """Whether the pipeline of a bank file applies, as none was chosen."""
         return self.preset is None and self.pipeline is None
 
-    def load_mesh(self, path: Path) -> Any:
+    def load_mesh(self, path: Path) -> "Mesh":
         """The mesh of a file, with the options that say how it is read."""
         from ..mesh import load_mesh
 

@@ -19,7 +19,6 @@ from ..errors import CurviregError, InvalidInputError
 from ..geometry import Camera, camera_matrix
 from ..geometry.pose_prior import PosePrior
 from ..mesh import load_mesh
-from ..mesh.mesh import mesh_unit
 from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.detection import detect_prepared
@@ -229,7 +228,7 @@ def _results_of(observation: Observation, registrar: Registrar) -> Results:
     camera = observation.camera
     item = observation.item
     if entry.start is not None:
-        start_pose = start_in_unit(entry.start, mesh_unit(registrar.bank.mesh))
+        start_pose = start_in_unit(entry.start, registrar.bank.mesh.unit)
         confidences = [entry.start.confidence]
         alone = replace(item, prior=None)
         return refine_prepared(registrar, [alone], [start_pose], start_confidences=confidences)

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import trimesh
-
 from ..formats.exports.trackers import write_m3t, write_visp
+from ..mesh import Mesh
 from ..mesh.edges import encloses_volumes, simplified
 from ..mesh.mesh import mesh_centre
 
@@ -16,7 +15,7 @@ polygon."""
 
 
 def write_start(
-    tracker: Literal["m3t", "visp"], out: Path, mesh: trimesh.Trimesh, document: Mapping[str, Any]
+    tracker: Literal["m3t", "visp"], out: Path, mesh: Mesh, document: Mapping[str, Any]
 ) -> None:
     """Write the files of M3T or ViSP into the folder ``out``; ``document`` is the content of
     ``result.json``, of a pose of ``mesh``.

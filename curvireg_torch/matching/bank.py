@@ -20,24 +20,20 @@ from tqdm import tqdm
 
 from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
 from ..geometry.viewpoint import ViewSphere, up_rotation
-from ..mesh import MeshWarning, has_colours, mesh_symmetries, mesh_warnings
-from ..mesh.colours import SurfaceColours, surface_colours
+from ..mesh import Mesh, MeshWarning, mesh_symmetries
+from ..mesh.colours import SurfaceColours
 from ..mesh.mesh import (
     as_mesh,
     checked_triangles,
     extreme_points,
-    measures_of,
     mesh_radius,
-    mesh_unit,
-    mesh_up,
     principal_rotation,
 )
 from ..mesh.reflections import reflection_plane
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
 from ..terms import Appearance, Precision, Whitening, ledoit_wolf
-from ..utils.checks import check_finite, check_option, check_symmetries, check_tensor
-from ..utils.choices import UNITS, UP_AXES
+from ..utils.checks import check_finite, check_symmetries, check_tensor
 from ..utils.files import tensor_checksum, write_tensors
 from ..utils.likes import MeshLike
 from ..utils.threads import single_threaded_pool
@@ -82,7 +78,7 @@ class ViewBank:
 
     def __init__(
         self,
-        mesh: trimesh.Trimesh,
+        mesh: Mesh,
         views: ViewSphere,
         pipeline: Pipeline,
         tensors: Mapping[str, Tensor],
@@ -279,16 +275,16 @@ class ViewBank:
         contents = {**self.tensors, "descriptors": self.descriptors.half()}
         contents |= {f"views.{f.name}": getattr(self.views, f.name) for f in fields(ViewSphere)}
         arrays = {f"mesh.{name}": x for name, x in colour_arrays(self.mesh).items()}
-        meshes = {"mesh": self.mesh}
+        surfaces = {"mesh": self.mesh.surface}
         if len(self.mesh.faces) > VIEW_FACES:
-            meshes["view_mesh"] = view_mesh(self.mesh)
-        for kind, mesh in meshes.items():
-            arrays[f"{kind}.vertices"] = np.array(mesh.vertices, np.float64)
-            arrays[f"{kind}.faces"] = np.array(mesh.faces, np.int32)
+            surfaces["view_mesh"] = view_mesh(self.mesh)
+        for kind, surface in surfaces.items():
+            arrays[f"{kind}.vertices"] = np.array(surface.vertices, np.float64)
+            arrays[f"{kind}.faces"] = np.array(surface.faces, np.int32)
         contents |= {name: torch.from_numpy(x.copy()) for name, x in arrays.items()}
         contents["extreme_points"] = extreme_points(self.mesh)
         contents["reflection_plane"] = _rows(reflection_plane(self.mesh))
-        if not has_colours(self.mesh):
+        if not self.mesh.has_colours:
             contents["mesh_symmetries"] = mesh_symmetries(self.mesh)
         angle = self._compared_angle()
         if angle is not None:
@@ -297,10 +293,10 @@ class ViewBank:
             "format": FORMAT,
             "version": str(FORMAT_VERSION),
             "pipeline": self.pipeline.to_json(),
-            "mesh": str(self.mesh.metadata.get("file_name", "")),
-            "unit": mesh_unit(self.mesh) or "",
-            "up": mesh_up(self.mesh),
-            "warnings": json.dumps([asdict(warning) for warning in mesh_warnings(self.mesh)]),
+            "mesh": self.mesh.file_name,
+            "unit": self.mesh.unit or "",
+            "up": self.mesh.up,
+            "warnings": json.dumps([asdict(warning) for warning in self.mesh.warnings]),
             "packing": json.dumps(angle),
             "checksum": tensor_checksum(contents),
         }
@@ -332,11 +328,7 @@ class ViewBank:
             pipeline = Pipeline.from_json(metadata["pipeline"])
             views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
             tensors["descriptors"] = tensors["descriptors"].float()
-            mesh = _mesh(tensors, metadata["unit"], metadata["up"])
-            noticed = json.loads(metadata.get("warnings", "[]"))
-            mesh.metadata["warnings"] = tuple(
-                MeshWarning(str(one["kind"]), str(one["text"])) for one in noticed
-            )
+            mesh = _mesh(tensors, metadata)
             _check_contents(views, pipeline.bank, tensors)
             packings = _packings(tensors, json.loads(metadata["packing"]), len(views))
         except BankError as error:
@@ -379,17 +371,17 @@ def views_at_a_time(image_size: int) -> int:
     return TURNS * max(1, PIXELS_AT_A_TIME // (TURNS * image_size**2))
 
 
-def view_frame(mesh: trimesh.Trimesh, policy: ViewPolicy) -> Tensor:
+def view_frame(mesh: Mesh, policy: ViewPolicy) -> Tensor:
     """(3, 3) float64 rotation from the mesh's frame to the one in which the policy's azimuth and
     elevation are."""
-    return principal_rotation(mesh) if policy.frame == "principal" else up_rotation(mesh_up(mesh))
+    return principal_rotation(mesh) if policy.frame == "principal" else up_rotation(mesh.up)
 
 
-def views_of(mesh: trimesh.Trimesh, policy: ViewPolicy) -> ViewSphere:
+def views_of(mesh: Mesh, policy: ViewPolicy) -> ViewSphere:
     """The policy's views of a mesh, in the mesh's own frame."""
     if policy.frame == "principal":
         return policy.sphere().in_frame(view_frame(mesh, policy))
-    return policy.sphere(mesh_up(mesh))
+    return policy.sphere(mesh.up)
 
 
 def packed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -409,34 +401,39 @@ def _pack(mask: Tensor) -> Tensor:
     return packed
 
 
-def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
-    mesh = _triangles(tensors, "mesh")
-    measures = measures_of(mesh)
+def _mesh(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> Mesh:
+    """The mesh of a bank's file, with what this knows of it."""
+    noticed = json.loads(metadata.get("warnings", "[]"))
+    mesh = Mesh(
+        _triangles(tensors, "mesh"),
+        unit=metadata["unit"] or None,
+        up=metadata["up"],
+        colours=_colours(tensors),
+        warnings=tuple(MeshWarning(str(one["kind"]), str(one["text"])) for one in noticed),
+        file_name=metadata["mesh"],
+    )
+    if mesh.colours is not None:
+        mesh.colours.check(len(mesh.faces))
+    measures = mesh.measures
     measures |= {n: tensors[n] for n in ("extreme_points", "mesh_symmetries") if n in tensors}
     if len(mesh.faces) > VIEW_FACES:
         measures["view_mesh"] = _triangles(tensors, "view_mesh")
     measures["reflection_plane"] = _plane(tensors["reflection_plane"])
     _check_extreme_points(mesh)
-    check_option(up, UP_AXES, "up")
-    if unit:
-        check_option(unit, UNITS, "unit")
-        mesh.units = unit
-    mesh.metadata["up"] = up
-    if "mesh.colours.uv" in tensors:
-        colours = {
-            n.removeprefix("mesh.colours."): x.numpy()
-            for n, x in tensors.items()
-            if "mesh.colours." in n
-        }
-        textures = tuple(colours[f"picture{k}"] for k in range(len(colours) - 3))
-        surface = SurfaceColours(
-            colours["corners"], colours["uv"].astype(np.float32), colours["texture"], textures
-        )
-        surface.check(len(mesh.faces))
-        mesh.metadata["colours"] = surface
-    if not has_colours(mesh):
+    if not mesh.has_colours:
         check_symmetries(mesh_symmetries(mesh))
     return mesh
+
+
+def _colours(tensors: Mapping[str, Tensor]) -> SurfaceColours | None:
+    """What :func:`colour_arrays` are of."""
+    prefix = "mesh.colours."
+    arrays = {n.removeprefix(prefix): x.numpy() for n, x in tensors.items() if prefix in n}
+    if "uv" not in arrays:
+        return None
+    textures = tuple(arrays[f"picture{k}"] for k in range(len(arrays) - 3))
+    uv = arrays["uv"].astype(np.float32)
+    return SurfaceColours(arrays["corners"], uv, arrays["texture"], textures)
 
 
 def _triangles(tensors: Mapping[str, Tensor], name: str) -> trimesh.Trimesh:
@@ -450,7 +447,7 @@ def _triangles(tensors: Mapping[str, Tensor], name: str) -> trimesh.Trimesh:
     return mesh
 
 
-def _check_extreme_points(mesh: trimesh.Trimesh) -> None:
+def _check_extreme_points(mesh: Mesh) -> None:
     """Raise for points that do not fill the mesh's box, as those outermost in all directions do."""
     points = extreme_points(mesh)
     check_tensor(points, "extreme_points", (None, 3))
@@ -481,9 +478,9 @@ def _plane(rows: Tensor) -> Tensor | None:
     return rows[0] if len(rows) else None
 
 
-def colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
+def colour_arrays(mesh: Mesh) -> dict[str, np.ndarray]:
     """The mesh's colours as arrays, without loss; empty for a mesh without colours."""
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     if colours is None:
         return {}
     arrays: dict[str, np.ndarray] = {

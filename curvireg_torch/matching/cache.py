@@ -13,11 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import trimesh
 
 from ..errors import BankError, OutputError
 from ..geometry.viewpoint import ViewSphere
-from ..mesh.mesh import as_mesh, mesh_up, mesh_warnings
+from ..mesh import as_mesh
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import cache_folder, tensor_digest, text_digest
@@ -49,7 +48,7 @@ class CachedBank(NamedTuple):
 
 
 def bank_key(
-    mesh: trimesh.Trimesh,
+    mesh: MeshLike,
     views: ViewSphere,
     *,
     pipeline: Pipeline | None = None,
@@ -66,6 +65,7 @@ def bank_key(
         >>> len(key), key == bank_key(mesh, views, pipeline=cr.Pipeline(hypotheses=1))
         (32, True)
     """
+    mesh = as_mesh(mesh)
     pipeline = pipeline or Pipeline()
     settings = {
         **asdict(pipeline.bank),
@@ -81,7 +81,7 @@ def bank_key(
     tensors |= {
         f"views.{field.name}": getattr(views, field.name).double() for field in fields(ViewSphere)
     }
-    facts = [FORMAT_VERSION, settings, mesh_up(mesh), renderer]
+    facts = [FORMAT_VERSION, settings, mesh.up, renderer]
     digests = [import_digest(_BUILDER), tensor_digest(tensors, size=16)]
     return text_digest(json.dumps([facts, digests], sort_keys=True), size=16)
 
@@ -145,8 +145,8 @@ def cached_bank(
         with suppress(OSError):  # a read-only cache
             os.utime(path)
         # the file may have been stored in another unit, or of another file of this surface
-        bank.mesh.units = mesh.units
-        bank.mesh.metadata["warnings"] = mesh_warnings(mesh)
+        mesh.measures.update(bank.mesh.measures)
+        bank.mesh = mesh
     bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
     bank.described_views_file = _described_views_file(path) if bank.device.type == "cpu" else None
     if is_new:

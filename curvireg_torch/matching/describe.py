@@ -11,13 +11,13 @@ from ..features import HOG, field_points
 from ..filters import apparent_ridges, average_shading_gradient
 from ..geometry.cameras import boxes_around, projected, transform
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
-from ..mesh.colours import has_colours
 from ..mesh.edges import simplified
-from ..mesh.mesh import cached_in_mesh, extreme_points, mesh_centre, mesh_radius
+from ..mesh.mesh import as_mesh, extreme_points, measure, mesh_centre, mesh_radius
 from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
 from ..rendering.contours import LEVELS, MeshContours
 from ..rendering.zbuffer import DeviceRenderer
+from ..utils.likes import MeshLike
 
 VIEWS_AT_A_TIME = 64  # Views in memory at a time
 # to which larger meshes are simplified for views: their contours are those of full size
@@ -48,7 +48,7 @@ def hog_layer(settings: BankSettings) -> HOG:
     return HOG(grid=settings.grid, bins=settings.bins, block=settings.block, clip=settings.clip)
 
 
-@cached_in_mesh
+@measure
 def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """What framed views of a mesh of more than ``VIEW_FACES`` faces are rendered from, with no more
     than these."""
@@ -72,14 +72,14 @@ class ViewDescriber:
 
     def __init__(
         self,
-        mesh: trimesh.Trimesh,
+        mesh: MeshLike,
         settings: BankSettings,
         *,
         renderer: str | DepthRenderer = "auto",
         device: torch.device | str = "cpu",
     ) -> None:
-        self._mesh = self.view_mesh = mesh
-        self._coloured = has_colours(mesh)
+        self._mesh = mesh = as_mesh(mesh)
+        self.view_mesh = mesh.surface
         self.renderer = self.view_renderer = make_renderer(mesh, renderer, many_views=True)
         self.centre = mesh_centre(mesh)
         self.radius = mesh_radius(mesh)
@@ -193,7 +193,7 @@ class ViewDescriber:
         S = self.settings.image_size
         projection = {"orthographic": self._orthographic}
         grey = shade(depth, K, **projection)
-        if not self._coloured:
+        if not self._mesh.has_colours:
             return grey
         colour = render_colour(self._mesh, T, K, (S, S), renderer=self.renderer, **projection)
         return torch.cat([grey, colour.to(grey)], dim=1)
@@ -201,7 +201,7 @@ class ViewDescriber:
     @property
     def draws_colours(self) -> bool:
         """Whether the mesh has colours, and :meth:`draw` can show them."""
-        return self._coloured and hasattr(self.renderer, "faces_at")
+        return self._mesh.has_colours and hasattr(self.renderer, "faces_at")
 
     def draw(self, T: Tensor, K: Tensor, size: tuple[int, int]) -> Tensor:
         """(N, 3, H, W) of :func:`curvireg_torch.rendering.render_colour`."""

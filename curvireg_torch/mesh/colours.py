@@ -1,14 +1,11 @@
 """Colours of the surface of a mesh: whether they vary, and what they are at its points."""
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.meshes.colours import SurfaceColours as SurfaceColours
 from ..formats.meshes.colours import colours_of_parts as colours_of_parts
-from ..formats.meshes.colours import surface_colours as surface_colours
 
 SAMPLES = 20_000  # Points of the surface at which colours are compared
 # Colours vary if so large a fraction of the surface differs by so much, of 255, from the median: a
@@ -18,25 +15,13 @@ VARIED_BY = 12
 ROW = 1024  # Samples in a row of the map that OpenCV is given, whose sides are limited
 
 
-def has_colours(mesh: Any) -> bool:
-    """Whether a mesh has colours that vary over its surface: one plain material is no print. The
-    only place where it is decided; symmetries, appearance and fits to colours follow it.
-
-    Example:
-        >>> from curvireg_torch.synthetic import example_mesh
-        >>> has_colours(example_mesh()), has_colours(example_mesh(painted=True))
-        (False, True)
-    """
-    colours = surface_colours(mesh)
-    return colours is not None and _vary(colours, mesh)
-
-
-def _vary(colours: SurfaceColours, mesh: Any) -> bool:
+def colours_vary(colours: SurfaceColours, areas: NDArray[np.float64]) -> bool:
+    """Whether colours differ over the surface, whose faces have some areas (F,)."""
     corners = colours.corners.reshape(-1, 3)
     if not len(corners) or (not colours.textures and (corners == corners[0]).all()):
         return False
     rng = np.random.default_rng(0)
-    area = np.cumsum(mesh.area_faces)
+    area = np.cumsum(areas)
     face = (
         np.searchsorted(area, rng.uniform(0.0, area[-1], SAMPLES))
         .clip(max=len(area) - 1)

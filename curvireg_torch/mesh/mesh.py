@@ -1,13 +1,14 @@
-"""One clean ``trimesh.Trimesh`` from files, scenes and meshes, and its measures."""
+"""One clean mesh from files, scenes and other meshes, and its measures."""
 
 import math
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import wraps
+from dataclasses import dataclass, field, replace
+from functools import cached_property, wraps
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -28,10 +29,73 @@ from ..formats.meshes.source import MeshWarning
 from ..utils.checks import check_option
 from ..utils.choices import UNITS, UP_AXES
 from ..utils.likes import MeshLike
-from .colours import colours_of_parts
+from .colours import SurfaceColours, colours_of_parts, colours_vary
 from .health import precision_warning, stray_faces, stray_warning
 
-Found = TypeVar("Found")
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A clean surface with what is known about it, made by :func:`load_mesh` or :func:`as_mesh`. It
+    does not change: ``dataclasses.replace`` makes another one.
+
+    Attributes:
+        surface: its triangles, not to be changed.
+        unit: of lengths, "m", "dm", "cm", "mm", "in" or "ft"; None if it is unknown.
+        up: the axis that points up, "x", "y", "z", "-x", "-y" or "-z". The surface and poses stay
+            in the file's frame.
+        colours: textures and other colours of the faces; None without.
+        warnings: what the mesh lacks, or what was changed in it, as :func:`load_mesh` noticed.
+        file_name: "" without a file.
+        measures: of the mesh, by the names of the functions that compute them; filled as they are
+            wanted.
+
+    Example:
+        >>> import trimesh
+        >>> mesh = Mesh(trimesh.creation.box((1.0, 2.0, 2.0)), unit="cm")
+        >>> mesh.vertices.shape, mesh.faces.shape, mesh.extents.tolist(), mesh.has_colours
+        ((8, 3), (12, 3), [1.0, 2.0, 2.0], False)
+    """
+
+    surface: trimesh.Trimesh
+    unit: str | None = None
+    up: str = "z"
+    colours: SurfaceColours | None = None
+    warnings: tuple[MeshWarning, ...] = ()
+    file_name: str = ""
+    measures: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.unit is not None:
+            check_option(self.unit, UNITS, "unit")
+        check_option(self.up, UP_AXES, "up")
+
+    @property
+    def vertices(self) -> NDArray[np.float64]:
+        """(V, 3)."""
+        return np.asarray(self.surface.vertices)
+
+    @property
+    def faces(self) -> NDArray[np.int64]:
+        """(F, 3) indices of vertices."""
+        return np.asarray(self.surface.faces)
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """(2, 3) lowest and highest coordinates."""
+        return np.asarray(self.surface.bounds)
+
+    @property
+    def extents(self) -> NDArray[np.float64]:
+        """(3,) sides of the axis-aligned box."""
+        return np.asarray(self.surface.extents)
+
+    @cached_property
+    def has_colours(self) -> bool:
+        """Whether colours vary over the surface: one plain material is no print. The only place
+        where it is decided; symmetries, appearance and fits to colours follow it."""
+        return self.colours is not None and colours_vary(self.colours, self.surface.area_faces)
 
 
 def load_mesh(
@@ -41,7 +105,7 @@ def load_mesh(
     up: str | None = None,
     link: str | None = None,
     textures: str | PathLike[str] | None = None,
-) -> trimesh.Trimesh:
+) -> Mesh:
     """Read a mesh file; scenes become one mesh, polygons become triangles, normals are ignored.
 
     Nothing is rescaled: vertices, and every pose computed from them, stay in the file's frame and
@@ -50,22 +114,19 @@ def load_mesh(
     Args:
         path: .obj, .ply, .stl, .off, .glb, .gltf, .3mf or .urdf; with the extra ``cad`` also .step,
             .stp, .iges, .igs and .dae.
-        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``.
-            None: that which the file itself states (STEP, IGES, 3MF, Collada, USD; URDF is in m),
-            else cm for USD, as OpenUSD does, and m for other formats. An object below 5 mm or above
-            100 m gets a warning.
-        up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in
-            ``mesh.metadata["up"]``; None: that which the file states, else y for glTF and z for
-            other formats.
+        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"). None: that which the
+            file itself states (STEP, IGES, 3MF, Collada, USD; URDF is in m), else cm for USD, as
+            OpenUSD does, and m for other formats. An object below 5 mm or above 100 m gets a
+            warning.
+        up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"); None: that which the file
+            states, else y for glTF and z for other formats.
         link: the link of a URDF whose mesh is read, in the link's frame; None: all links, with all
             joints at zero.
         textures: a further folder in which files are looked for that the mesh names.
 
     Returns:
-        Vertices (V, 3) float64, faces (F, 3) without degenerate ones and without small parts far
-        away, and textures and other colours as one :class:`SurfaceColours` in
-        ``mesh.metadata["colours"]``, which count if they vary (:func:`has_colours`). What the mesh
-        lacks is in :func:`mesh_warnings`, and a :class:`CurviregWarning` each.
+        The mesh, without degenerate faces and small parts far away. What it lacks is in its
+        ``warnings``, and a :class:`CurviregWarning` each.
 
     Raises:
         MissingFileError: the file does not exist.
@@ -80,8 +141,8 @@ def load_mesh(
         ...     path = Path(folder) / "part.stl"
         ...     _ = trimesh.creation.box((100.0, 200.0, 300.0)).export(path)
         ...     mesh = load_mesh(path, unit="mm")
-        >>> mesh_unit(mesh), len(mesh.faces)
-        ('mm', 12)
+        >>> mesh.unit, mesh.up, len(mesh.faces)
+        ('mm', 'z', 12)
     """
     path = Path(path)
     if unit is not None:
@@ -95,20 +156,22 @@ def load_mesh(
         )
         raise MeshError(message, subject=path)
     whole = trimesh.Trimesh(found.vertices, found.faces, process=False)
-    whole.metadata["colours"] = found.colours
-    whole.metadata["warnings"] = found.warnings
-    mesh = as_mesh(whole, name=str(path))
-    mesh.units = unit or found.unit or found.usual_unit or "m"
-    mesh.metadata.update(file_name=path.name, up=up or found.up or format_up(path.suffix))
+    unit = unit or found.unit or found.usual_unit or "m"
+    mesh = replace(
+        _cleaned(whole, found.colours, found.warnings, str(path)),
+        unit=unit,
+        up=up or found.up or format_up(path.suffix),
+        file_name=path.name,
+    )
     length = float(np.linalg.norm(mesh.extents))
-    size = length * UNITS[mesh.units]
+    size = length * UNITS[unit]
     if not _is_plausible(size):
         likely = next((name for name in LIKELY_UNITS if _is_plausible(length * UNITS[name])), None)
         advice = "" if found.unit else f"; if that is wrong, give the unit{_question(likely)}"
-        message = f"in unit {mesh.units!r} the object is {size:g} m across{advice}"
+        message = f"in unit {unit!r} the object is {size:g} m across{advice}"
         kind = "" if found.unit else "unit"
         warnings.warn(CurviregWarning(message, subject=path, kind=kind), stacklevel=2)
-    for warning in mesh_warnings(mesh):
+    for warning in mesh.warnings:
         warnings.warn(CurviregWarning(warning.text, subject=path), stacklevel=2)
     return mesh
 
@@ -125,53 +188,55 @@ def _question(unit: str | None) -> str:
     return "" if unit is None else f" ({unit}?)"
 
 
-def as_mesh(source: MeshLike, *, name: str = "mesh") -> trimesh.Trimesh:
-    """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; errors as
-    :func:`load_mesh`.
+def as_mesh(source: MeshLike, *, name: str = "mesh") -> Mesh:
+    """A mesh from a path, a ``trimesh.Trimesh``, whose ``units`` are kept, or a ``trimesh.Scene``;
+    a :class:`Mesh` as it is. Errors are those of :func:`load_mesh`.
 
     Example:
         >>> import trimesh
         >>> len(as_mesh(trimesh.Scene([trimesh.creation.box(), trimesh.creation.box()])).faces)
         24
     """
+    if isinstance(source, Mesh):
+        return source
     if isinstance(source, str | PathLike):
         return load_mesh(source)
-    noticed = list(mesh_warnings(source)) if isinstance(source, trimesh.Trimesh) else []
+    whole: Any = source
+    colours = None
     if isinstance(source, trimesh.Scene):
         try:
-            source, colours = joined_scene(source)
+            whole, colours = joined_scene(source)
         except Exception as error:  # singular transforms, unconnected parts, malformed vertices
             raise MeshError(
                 f"its parts cannot be put together ({error}); re-export the file", subject=name
             ) from error
     elif isinstance(source, trimesh.Trimesh):
         (colours,) = colours_of_parts([source])
+    mesh = _cleaned(whole, colours, (), name)
+    return replace(mesh, unit=_unit_of(whole), file_name=whole.metadata.get("file_name", ""))
+
+
+def _cleaned(
+    source: Any, colours: SurfaceColours | None, noticed: Sequence[MeshWarning], name: str
+) -> Mesh:
+    """A surface and its colours without degenerate and stray faces, and what was ``noticed`` in its
+    file or now."""
     if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
         raise MeshError(_why_no_faces(source, noticed), subject=name)
     triangles, is_degenerate = checked_triangles(source, name)
-    vertices = np.asarray(source.vertices, dtype=np.float64)
-    mesh = trimesh.Trimesh(vertices=vertices, faces=triangles[~is_degenerate], process=False)
+    vertices = np.array(source.vertices, dtype=np.float64)  # the source may change
+    surface = trimesh.Trimesh(vertices=vertices, faces=triangles[~is_degenerate], process=False)
     colours = None if colours is None else colours[~is_degenerate]
-    stray = stray_faces(mesh)
+    stray = stray_faces(surface)
+    found = [*noticed]
     if stray.any():
-        noticed.append(stray_warning(mesh, stray))
-        mesh = trimesh.Trimesh(vertices=vertices, faces=mesh.faces[~stray], process=False)
+        found.append(stray_warning(surface, stray))
+        surface = trimesh.Trimesh(vertices=vertices, faces=surface.faces[~stray], process=False)
         colours = None if colours is None else colours[~stray]
-    mesh.remove_unreferenced_vertices()
-    noticed += [
-        warning
-        for warning in [precision_warning(mesh)]
-        if warning is not None and warning not in noticed
-    ]
-    unit = mesh_unit(source)
-    if unit is not None:  # trimesh keeps None as the word "none"
-        mesh.units = unit
-    mesh.metadata.update(file_name=source.metadata.get("file_name", ""), up=mesh_up(source))
-    if noticed:
-        mesh.metadata["warnings"] = tuple(noticed)
-    if colours is not None:
-        mesh.metadata["colours"] = colours
-    return mesh
+    surface.remove_unreferenced_vertices()
+    if (rounded := precision_warning(surface)) is not None:
+        found.append(rounded)
+    return Mesh(surface, colours=colours, warnings=tuple(found))
 
 
 def _why_no_faces(source: object, noticed: Sequence[MeshWarning]) -> str:
@@ -185,18 +250,6 @@ def _why_no_faces(source: object, noticed: Sequence[MeshWarning]) -> str:
             f"be rendered; reconstruct its surface, or export a mesh"
         )
     return "expected a mesh with faces, got none; points and curves cannot be rendered"
-
-
-def mesh_warnings(mesh: trimesh.Trimesh) -> tuple[MeshWarning, ...]:
-    """What a mesh lacks, or what was changed in it, as :func:`load_mesh` noticed.
-
-    Example:
-        >>> import trimesh
-        >>> mesh_warnings(trimesh.creation.box())
-        ()
-    """
-    found = mesh.metadata.get("warnings", ())
-    return tuple(warning for warning in found if isinstance(warning, MeshWarning))
 
 
 # Points of a hull: to project more of them in every view costs more than to cast the rays
@@ -249,21 +302,13 @@ def checked_triangles(
     return faces, ~(area > 0)
 
 
-def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
-    """The unit that ``mesh.units`` names, as a key of ``UNITS``; None where it names none of
-    them.
-
-    Example:
-        >>> import trimesh
-        >>> mesh = trimesh.creation.box()
-        >>> mesh.units = "millimeters"
-        >>> mesh_unit(mesh)
-        'mm'
-    """
-    if mesh.units in UNITS:
-        return str(mesh.units)
+def _unit_of(surface: trimesh.Trimesh) -> str | None:
+    """The unit that ``surface.units`` names, as a key of ``UNITS``; None where it names none of
+    them."""
+    if surface.units in UNITS:
+        return str(surface.units)
     try:
-        metres = trimesh.units.unit_conversion(mesh.units, "meters")
+        metres = trimesh.units.unit_conversion(surface.units, "meters")
     except (AttributeError, ValueError):
         return None
     return next(
@@ -277,74 +322,34 @@ def format_up(suffix: str) -> str:
     return "y" if suffix.lower() in (".glb", ".gltf") else "z"
 
 
-def mesh_up(mesh: trimesh.Trimesh) -> str:
-    """The axis that :func:`load_mesh` noted, "z" for meshes from elsewhere; mesh and poses stay in
-    the file's frame.
-
-    Example:
-        >>> import trimesh
-        >>> mesh_up(trimesh.creation.box())
-        'z'
-    """
-    return str(mesh.metadata.get("up", "z"))
-
-
 MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
 """The reflection that makes the mirror image of a mesh: of its x axis."""
 
 
-def mirrored(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mirror image of a mesh's shape, without colours."""
-    vertices = np.asarray(mesh.vertices) @ MIRROR.numpy()
-    return trimesh.Trimesh(vertices, mesh.faces[:, [0, 2, 1]], process=False)
+def mirrored(surface: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mirror image of a surface."""
+    vertices = np.asarray(surface.vertices) @ MIRROR.numpy()
+    return trimesh.Trimesh(vertices, surface.faces[:, [0, 2, 1]], process=False)
 
 
-class _Measures(dict[str, Any]):
-    """Measures of a geometry, by name. Copies of a mesh share them: one may be the mesh itself, and
-    none changes."""
-
-    def __deepcopy__(self, memo: Any) -> Self:
-        return self
-
-
-def measures_of(mesh: trimesh.Trimesh) -> dict[str, Any]:
-    """What is known of a mesh with these vertices and faces, by the names of the functions that
-    measure it; it travels with the mesh, as its metadata do. Banks store such values.
-
-    Example:
-        >>> import trimesh
-        >>> mesh = trimesh.creation.box()
-        >>> points, known = extreme_points(mesh), list(measures_of(mesh))
-        >>> known, list(measures_of(mesh.apply_scale(2.0)))
-        (['extreme_points'], [])
-    """
-    geometry = hash(mesh)
-    of_geometry, known = mesh.metadata.get("measures", (None, None))
-    if of_geometry != geometry:
-        known = _Measures()
-        mesh.metadata["measures"] = geometry, known
-    return cast(dict[str, Any], known)
-
-
-def cached_in_mesh(
-    function: Callable[[trimesh.Trimesh], Found],
-) -> Callable[[trimesh.Trimesh], Found]:
-    """Decorate a function of a mesh whose value is one of :func:`measures_of` it; callers get
-    copies of tensors."""
+def measure(function: Callable[[trimesh.Trimesh], Value]) -> Callable[[Any], Value]:
+    """Decorate a function of a surface: a :class:`Mesh` keeps its value among its ``measures``, and
+    callers get copies of tensors."""
     name = function.__name__
 
     @wraps(function)
-    def value_of(mesh: trimesh.Trimesh) -> Found:
-        known = measures_of(mesh)
-        if name not in known:
-            known[name] = function(mesh)
-        value = known[name]
-        return cast(Found, value.clone() if isinstance(value, Tensor) else value)
+    def value_of(mesh: Any) -> Value:
+        if not isinstance(mesh, Mesh):
+            return function(mesh)
+        if name not in mesh.measures:
+            mesh.measures[name] = function(mesh.surface)
+        value = mesh.measures[name]
+        return cast(Value, value.clone() if isinstance(value, Tensor) else value)
 
     return value_of
 
 
-@cached_in_mesh
+@measure
 def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
     """(P, 3) float64 vertices of the convex hull, which determine projected boxes. Of more than
     4096 of them, those outermost in 2562 directions of the object scaled to equal extents: sides of
@@ -363,12 +368,12 @@ def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
     return torch.from_numpy(points)
 
 
-def box_corners(mesh: trimesh.Trimesh) -> Tensor:
+def box_corners(mesh: Mesh | trimesh.Trimesh) -> Tensor:
     """(8, 3) float64 corners of the axis-aligned box, in model units."""
     return torch.cartesian_prod(*torch.from_numpy(np.array(mesh.bounds, dtype=np.float64)).T)
 
 
-def mesh_centre(mesh: trimesh.Trimesh) -> Tensor:
+def mesh_centre(mesh: Mesh | trimesh.Trimesh) -> Tensor:
     """(3,) float64 centre of the axis-aligned box, in model units.
 
     Example:
@@ -380,7 +385,7 @@ def mesh_centre(mesh: trimesh.Trimesh) -> Tensor:
     return torch.from_numpy(np.asarray(mesh.bounds, dtype=np.float64).mean(axis=0))
 
 
-def mesh_radius(mesh: trimesh.Trimesh) -> float:
+def mesh_radius(mesh: Mesh | trimesh.Trimesh) -> float:
     """Half the diagonal of the axis-aligned box, in model units.
 
     Example:
@@ -391,6 +396,7 @@ def mesh_radius(mesh: trimesh.Trimesh) -> float:
     return 0.5 * float(np.linalg.norm(mesh.extents))
 
 
+@measure
 def normalization_transform(mesh: trimesh.Trimesh) -> Tensor:
     """(4, 4) float64 similarity from the model's frame to the paper's normalised frame.
 
@@ -423,8 +429,7 @@ def normalization_transform(mesh: trimesh.Trimesh) -> Tensor:
     return torch.from_numpy(T)
 
 
-@cached_in_mesh
-def principal_rotation(mesh: trimesh.Trimesh) -> Tensor:
+def principal_rotation(mesh: Mesh | trimesh.Trimesh) -> Tensor:
     """(3, 3) float64 rotation of :func:`normalization_transform`."""
     R = normalization_transform(mesh)[:3, :3]
     rotation: Tensor = R / torch.linalg.vector_norm(R[0])

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .mesh import cached_in_mesh, mesh_radius, principal_rotation
+from .mesh import measure, mesh_radius, principal_rotation
 
 # Points of a surface that are reflected, and the distance from it, as a fraction of its radius,
 # within which that fraction of them lies if a mesh is its own mirror image
@@ -15,7 +15,7 @@ SAME_SHAPE = 0.03
 SAME_POINTS = 0.995
 
 
-@cached_in_mesh
+@measure
 def reflection_plane(mesh: trimesh.Trimesh) -> Tensor | None:
     """(3,) normal of the plane to which a mesh is most nearly symmetric, of those of the principal
     axes of its surface and of the mesh file's axes; None if it is symmetric to one of them,

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..geometry import rotation_from_axis_angle
-from .mesh import cached_in_mesh, mesh_radius
+from .mesh import measure, mesh_radius
 
 # Points of the surface that are compared with, and those that are turned
 POINTS = 20_000
@@ -40,7 +40,7 @@ class RoundAxis(NamedTuple):
     ends_are_alike: bool
 
 
-@cached_in_mesh
+@measure
 def round_axis(mesh: trimesh.Trimesh) -> RoundAxis | None:
     """The axis about which nine tenths of a mesh's surface are that of a body of revolution, as
     with a canister with ports or a cup with a hole in its lid; None if there is no such axis.

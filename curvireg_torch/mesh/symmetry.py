@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..geometry import rotation_from_axis_angle
-from .mesh import cached_in_mesh, mesh_radius
+from .mesh import measure, mesh_radius
 
 # Random points of the surface, and how many of them are compared with all
 POINTS = 40_000
@@ -49,7 +49,7 @@ DEFINED = 0.05
 NEARLY_EQUAL = 1.0 + 2.0 * math.cos(math.radians(5.0))
 
 
-@cached_in_mesh
+@measure
 def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
     """Rotations of a mesh that leave its shape as it is, up to small details, without colours. (S,
     4, 4) float64 transforms of the model frame, the identity first; S = 1 for a mesh without

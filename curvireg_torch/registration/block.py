@@ -19,7 +19,6 @@ from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.framing import CropFrame
 from ..geometry.pose_prior import object_frame
 from ..matching import Ranking, ViewBank
-from ..mesh import mesh_up
 from ..mesh.mesh import mesh_centre, mesh_radius
 from ..terms import Appearance, QueryFeatures
 from .hypotheses import Hypotheses, by_contours, fit_poses, placed
@@ -51,7 +50,7 @@ class Limits:
         self._off_centre = off_centre
         self.prior = item.prior
         self._bank = bank
-        self._frame = object_frame(mesh_up(bank.mesh), item.prior.front)
+        self._frame = object_frame(bank.mesh.up, item.prior.front)
         self._centre = mesh_centre(bank.mesh)
         self._towards = torch.eye(3, dtype=torch.float64)
         if item.camera_matrix is not None:

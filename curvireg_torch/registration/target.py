@@ -17,7 +17,7 @@ from ..geometry.framing import CropFrame, around_visible, border_sides, photogra
 from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber, ViewMatcher
 from ..matching.detector import Detector
-from ..mesh import has_colours, mesh_radius, mesh_symmetries, mesh_warnings
+from ..mesh import Mesh, mesh_radius, mesh_symmetries
 from ..mesh.mesh import mirrored
 from ..mesh.round_axis import RoundAxis, round_axis
 from ..mesh.symmetry import FEATURE_FRACTION, feature_fractions
@@ -130,7 +130,7 @@ class Target:
         if not exact or self.symmetries is not None:
             return self.symmetries
         with _SHAPE_LOCK:  # photographs share them
-            return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
+            return None if self.bank.mesh.has_colours else mesh_symmetries(self.bank.mesh)
 
     def score_weights(self, *, exact: bool) -> EvidenceWeights:
         """What evidence counts for with an exact mesh, or with a similar one."""
@@ -143,7 +143,7 @@ class Target:
         symmetries = self.symmetries_of(exact=True)
         if self.symmetries is not None or symmetries is None:
             return TellingSymmetries(torch.eye(4, dtype=torch.float64)[None])
-        return telling_symmetries(self.bank.mesh, symmetries)
+        return telling_symmetries(self.bank.mesh.surface, symmetries)
 
     @cached_property
     def round_axis(self) -> RoundAxis | None:
@@ -151,7 +151,7 @@ class Target:
         apart."""
         axis = round_axis(self.bank.mesh)
         return axis and axis._replace(
-            ends_are_alike=axis.ends_are_alike and not has_colours(self.bank.mesh)
+            ends_are_alike=axis.ends_are_alike and not self.bank.mesh.has_colours
         )
 
     def frame_of(self, box: Tensor, size: tuple[int, int]) -> CropFrame | None:
@@ -214,8 +214,8 @@ class Target:
 
     @property
     def mesh_notes(self) -> tuple[str, ...]:
-        """What the mesh lacks, in words: see :func:`curvireg_torch.mesh.mesh_warnings`."""
-        return tuple(warning.text for warning in mesh_warnings(self.bank.mesh))
+        """What the mesh lacks, in words."""
+        return tuple(warning.text for warning in self.bank.mesh.warnings)
 
     @cached_property
     def describer(self) -> ViewDescriber:
@@ -234,9 +234,8 @@ class Target:
     @cached_property
     def _mirror_image(self) -> "Target":
         known = self.describer
-        describer = ViewDescriber(
-            mirrored(known.view_mesh), known.settings, device=self.bank.device
-        )
+        mesh = Mesh(mirrored(known.view_mesh))
+        describer = ViewDescriber(mesh, known.settings, device=self.bank.device)
         image = copy(self)
         vars(image)["describer"] = describer
         return image
@@ -298,12 +297,12 @@ def nearest_view(target: Target, rotation: Tensor) -> int:
     return int((R.flatten(1) @ rotation.flatten().to(R)).argmax())
 
 
-def _flat_mesh_warnings(mesh: trimesh.Trimesh) -> tuple[str, ...]:
+def _flat_mesh_warnings(mesh: Mesh) -> tuple[str, ...]:
     """What makes every pose of a flat mesh questionable, in words."""
     vertices = torch.from_numpy(mesh.vertices.copy()).double()
     thickness = (
         float(torch.linalg.svdvals(vertices - vertices.mean(dim=0))[-1]) / len(vertices) ** 0.5
     )
-    if has_colours(mesh) or thickness > FLAT_EXTENT * mesh_radius(mesh):
+    if mesh.has_colours or thickness > FLAT_EXTENT * mesh_radius(mesh):
         return ()
     return ("the mesh is flat and has no colours: front and back look alike",)

@@ -11,7 +11,7 @@ import trimesh
 from torch import Tensor
 
 from ..mesh.edges import MeshEdges, occluding_edges
-from ..mesh.mesh import mesh_centre, mesh_radius
+from ..mesh.mesh import Mesh, mesh_centre, mesh_radius
 from ..utils.rows import Rows
 from .embree import RasterRenderer
 from .renderer import DepthRenderer
@@ -83,7 +83,7 @@ class MeshContours:
 
     device = torch.device("cpu")
 
-    def __init__(self, mesh: trimesh.Trimesh) -> None:
+    def __init__(self, mesh: Mesh | trimesh.Trimesh) -> None:
         self.centre = mesh_centre(mesh)
         self.radius = mesh_radius(mesh)
         self._edges: dict[int, MeshEdges] = {}

@@ -1,19 +1,18 @@
 """Renderers by name, and the depth that they draw."""
 
-from os import PathLike
-
 import trimesh
 from torch import Tensor
 
 from ..errors import InvalidInputError, RenderingError
-from ..mesh.mesh import as_mesh
+from ..mesh import Mesh, as_mesh
 from ..utils.checks import check_option
 from ..utils.choices import RENDERER_NAMES
+from ..utils.likes import MeshLike
 from .renderer import DepthRenderer
 
 
 def make_renderer(
-    mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto", *, many_views: bool = False
+    mesh: Mesh | trimesh.Trimesh, backend: str | DepthRenderer = "auto", *, many_views: bool = False
 ) -> DepthRenderer:
     """A renderer of ``mesh``, or ``backend`` if it is none of these names. All agree, and may be
     shared by threads:
@@ -51,7 +50,7 @@ def make_renderer(
 
 
 def render_depth(
-    mesh: "trimesh.Trimesh | trimesh.Scene | str | PathLike[str]",
+    mesh: MeshLike,
     T_cam_from_model: Tensor,
     camera_matrix: Tensor,
     size: tuple[int, int],

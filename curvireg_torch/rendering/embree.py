@@ -15,7 +15,7 @@ from embreex.rtcore_scene import EmbreeScene
 from torch import Tensor
 
 from ..mesh.edges import encloses_volumes
-from ..mesh.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
+from ..mesh.mesh import Mesh, box_corners, extreme_points, mesh_centre, mesh_radius
 from ..utils.threads import for_each
 from .renderer import NEAREST, check_render_arguments
 
@@ -78,7 +78,7 @@ class EmbreeRenderer:
 
     name = "embree"
 
-    def __init__(self, mesh: trimesh.Trimesh) -> None:
+    def __init__(self, mesh: Mesh | trimesh.Trimesh) -> None:
         # Embree and OpenCV compute in float32, so the object is centred and scaled to radius 1.
         self._mesh = mesh
         self._centre = mesh_centre(mesh).numpy()
@@ -221,7 +221,7 @@ class RasterRenderer(EmbreeRenderer):
 
     name = "auto"
 
-    def __init__(self, mesh: trimesh.Trimesh, *, many_views: bool = False) -> None:
+    def __init__(self, mesh: Mesh | trimesh.Trimesh, *, many_views: bool = False) -> None:
         super().__init__(mesh)
         self._corners = self._scaled(box_corners(mesh))
         self._vertices = float32(self._scaled(mesh.vertices))[:, None]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..errors import InvalidInputError, RenderingError
 from ..geometry.conversions import opencv_from_opengl
-from ..mesh.mesh import box_corners, mesh_centre, mesh_radius
+from ..mesh.mesh import Mesh, box_corners, mesh_centre, mesh_radius
 from .renderer import NEAREST, check_render_arguments
 
 _lock = threading.Lock()
@@ -73,7 +73,7 @@ class PyrenderRenderer:
 
     name = "pyrender"
 
-    def __init__(self, mesh: trimesh.Trimesh) -> None:
+    def __init__(self, mesh: Mesh | trimesh.Trimesh) -> None:
         self._centre = mesh_centre(mesh)
         self._radius = mesh_radius(mesh)
         self._corners = (box_corners(mesh) - self._centre) / self._radius

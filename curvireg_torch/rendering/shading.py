@@ -1,16 +1,14 @@
 """Shaded pictures of meshes, grey or in their colours."""
 
-from os import PathLike
-
 import numpy as np
 import torch
 import torch.nn.functional as F
-import trimesh
 from torch import Tensor
 
-from ..mesh.colours import colours_at, surface_colours
+from ..mesh.colours import colours_at
 from ..mesh.mesh import as_mesh
 from ..utils.checks import check_camera_matrix, check_image, check_tensor
+from ..utils.likes import MeshLike
 from .depth import make_renderer
 from .renderer import DepthRenderer, check_render_arguments
 
@@ -21,7 +19,7 @@ SUPERSAMPLING = 2  # Samples per pixel and axis, because textures are finer than
 
 @torch.no_grad()
 def render_colour(
-    mesh: "trimesh.Trimesh | trimesh.Scene | str | PathLike[str]",
+    mesh: MeshLike,
     T_cam_from_model: Tensor,
     camera_matrix: Tensor,
     size: tuple[int, int],
@@ -53,7 +51,7 @@ def render_colour(
     K = SUPERSAMPLING * zoom.double() @ K
     fine = SUPERSAMPLING * size[0], SUPERSAMPLING * size[1]
     backend = make_renderer(mesh, renderer)
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     faces_at = getattr(backend, "faces_at", None)
     albedo = np.ones((len(T), *fine, 3), np.float32)
     if colours is None or faces_at is None:

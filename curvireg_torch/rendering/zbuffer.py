@@ -6,7 +6,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from ..mesh.mesh import mesh_centre, mesh_radius
+from ..mesh.mesh import Mesh, mesh_centre, mesh_radius
 from .embree import EmbreeRenderer
 from .renderer import NEAREST, check_render_arguments
 
@@ -28,7 +28,7 @@ class DeviceRenderer:
 
     name = "torch"
 
-    def __init__(self, mesh: trimesh.Trimesh, device: torch.device | str) -> None:
+    def __init__(self, mesh: Mesh | trimesh.Trimesh, device: torch.device | str) -> None:
         self._mesh = mesh
         self._device = torch.device(device)
         self._radius = mesh_radius(mesh)

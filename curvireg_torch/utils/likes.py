@@ -36,6 +36,14 @@ class CalibratedCamera(Protocol):
         """(3, 3) camera matrix in px."""
 
 
+class CleanMesh(Protocol):
+    """A :class:`curvireg_torch.mesh.Mesh`."""
+
+    @property
+    def surface(self) -> "trimesh.Trimesh":
+        """Its triangles."""
+
+
 ArrayLike: TypeAlias = Tensor | np.ndarray[Any, Any] | Sequence[Any]
 """Numbers: a tensor, an array, or nested lists of these."""
 
@@ -59,5 +67,6 @@ photograph."""
 MaskLike: TypeAlias = ArrayLike | str | PathLike[str]
 """An (H, W) mask of the object, white, or the path of a picture."""
 
-MeshLike: TypeAlias = Union["trimesh.Trimesh", "trimesh.Scene", str, PathLike[str]]
-"""A mesh, a scene whose parts are joined, or the path of a file."""
+MeshLike: TypeAlias = Union[CleanMesh, "trimesh.Trimesh", "trimesh.Scene", str, PathLike[str]]
+"""A mesh of :func:`curvireg_torch.load_mesh` or of trimesh, a scene whose parts are joined, or the
+path of a file."""

@@ -6,12 +6,11 @@ import time
 import traceback
 from functools import partial
 
-import trimesh
-
 from ..errors import CurviregError
 from ..inspection.facts import mesh_facts
 from ..inspection.report import Inspection, look_alikes_of
 from ..jobs.options import RegisterOptions
+from ..mesh import Mesh
 from .session import Session, registrar_key
 
 MAX_SECONDS = 60.0  # after which an examination is given up
@@ -32,7 +31,7 @@ class Examination:
         self.session = session
         self.advice = ""
         self.waits = False
-        self._subject: tuple[trimesh.Trimesh, RegisterOptions] | None = None
+        self._subject: tuple[Mesh, RegisterOptions] | None = None
         self._task: asyncio.Task[None] | None = None
         self._deadline = 0.0
 
@@ -57,7 +56,7 @@ class Examination:
             self.advice = ""
             self._begin(self.session.mesh, math.inf)
 
-    def _begin(self, mesh: trimesh.Trimesh, seconds: float) -> None:
+    def _begin(self, mesh: Mesh, seconds: float) -> None:
         self._subject = mesh, registrar_key(self.session.request())
         self._deadline = time.monotonic() + seconds
         self._task = asyncio.create_task(self._run(*self._subject))
@@ -69,7 +68,7 @@ class Examination:
         mesh, key = self._subject
         return mesh is self.session.mesh and key == registrar_key(self.session.request())
 
-    async def _run(self, mesh: trimesh.Trimesh, key: RegisterOptions) -> None:
+    async def _run(self, mesh: Mesh, key: RegisterOptions) -> None:
         try:
             advice = await asyncio.to_thread(self.examined, mesh, key)
             if self._is_current():
@@ -84,7 +83,7 @@ class Examination:
         finally:
             self._task = None
 
-    def examined(self, mesh: trimesh.Trimesh, key: RegisterOptions) -> str:
+    def examined(self, mesh: Mesh, key: RegisterOptions) -> str:
         """The sentence about a mesh, as it is registered with the options."""
         facts = mesh_facts(mesh)
         if facts.is_hopeless:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import trimesh
 from torch import Tensor
 
 from ..data import load_camera, read_photo
@@ -33,7 +32,7 @@ from ..jobs.photograph import register_observation
 from ..jobs.rigs import read_rig, register_rig
 from ..jobs.views import View
 from ..matching import ViewBank
-from ..mesh import has_colours, mesh_centre, mesh_radius, mesh_unit, mesh_up, mesh_warnings
+from ..mesh import Mesh, mesh_centre, mesh_radius
 from ..registration import Registrar, Registration
 from ..utils.files import only_in
 from ..visualization.pose_glb import mesh_glb
@@ -71,7 +70,7 @@ class Session:
     rig: tuple[View, ...] = ()
     searched: tuple[Shot, ...] = ()
     mesh_path: Path | None = None
-    mesh: trimesh.Trimesh | None = None
+    mesh: Mesh | None = None
     mesh_facts: str = ""
     progress: tuple[str, int, int] = ("", 0, 1)
     cancelled: bool = False
@@ -320,8 +319,7 @@ class Session:
             mesh = self.options.load_mesh(path)
             size = " x ".join(f"{v:.4g}" for v in mesh.extents)
             facts = (
-                f"{len(mesh.faces):,} faces, {size} {mesh_unit(mesh)}, rendered "
-                f"{_colours_in_words(mesh)}"
+                f"{len(mesh.faces):,} faces, {size} {mesh.unit}, rendered {_colours_in_words(mesh)}"
             )
         self.mesh_path = path
         self.mesh = mesh
@@ -354,7 +352,7 @@ class Session:
     def object_frame(self) -> Tensor:
         """(3, 3) rotation from the mesh's axes to those of limits, see :func:`.object_frame`."""
         assert self.mesh is not None
-        return object_frame(mesh_up(self.mesh), (self.options.limits or {}).get("front"))
+        return object_frame(self.mesh.up, (self.options.limits or {}).get("front"))
 
     def hint_direction(self, position: Sequence[float]) -> None:
         """Limit the pose to views like that from a point beside the object, in the frame of limits,
@@ -545,10 +543,10 @@ def registrar_key(request: RegisterOptions) -> RegisterOptions:
     return replace(request, photos=(), box=None, limits=None, camera=None, guess=None)
 
 
-def _colours_in_words(mesh: trimesh.Trimesh) -> str:
+def _colours_in_words(mesh: Mesh) -> str:
     """How a mesh is rendered, and what it lacks."""
-    is_incomplete = any(warning.kind in ("texture", "material") for warning in mesh_warnings(mesh))
-    words = "in its colours" if has_colours(mesh) else "in grey"
+    is_incomplete = any(warning.kind in ("texture", "material") for warning in mesh.warnings)
+    words = "in its colours" if mesh.has_colours else "in grey"
     if is_incomplete:
         words = words.replace("its", "some of its")
         return f"{words}: materials or textures are missing; send it with them in a zip archive"

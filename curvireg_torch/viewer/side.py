@@ -14,7 +14,6 @@ from nicegui import ui
 from ..errors import MAX_VIEWER_FACES
 from ..geometry import Camera, rotation_error
 from ..jobs.store import to_json
-from ..mesh import mesh_unit, mesh_up
 from ..registration.confidence import two_decimals
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
@@ -181,12 +180,12 @@ class Answers:
             pose = replace(pose, rotation=shot.projection[0][:3, :3])
         mesh = result.registrar.bank.mesh
         front = (self.session.options.limits or {}).get("front")
-        lines = [pose_in_words(pose.rotation, up=mesh_up(mesh), front=front)]
+        lines = [pose_in_words(pose.rotation, up=mesh.up, front=front)]
         lines.append(
             "azimuth {:.1f}, elevation {:.1f}, theta {:.1f} degrees".format(*pose.viewpoint)
         )
         if pose.translation is not None:
-            unit = mesh_unit(mesh) or "in the mesh's unit"
+            unit = mesh.unit or "in the mesh's unit"
             frame = "translation" if shot.view is None else "translation in the world"
             deviation = (document.get("camera") or {}).get("focal_deviation", 0.0)
             numbers = ", ".join(measured(pose.translation.tolist(), deviation))
@@ -442,7 +441,8 @@ class Preview:
             self.session.hint_direction((at["x"], at["y"], at["z"]))
 
     async def _clicked(self, event: Any) -> None:
-        if not self.mark or not event.hits:
+        mesh = self.session.mesh
+        if mesh is None or not self.mark or not event.hits:
             return
         name = self.mark
         self.mark = ""
@@ -451,7 +451,7 @@ class Preview:
         if name == "up":
             self.session.set_limits(front=None)
             await self.workspace.set_option("up", axis)
-        elif axis[-1] != mesh_up(self.session.mesh)[-1]:
+        elif axis[-1] != mesh.up[-1]:
             self.session.set_limits(front=axis)
 
     async def refresh(self) -> None:
@@ -536,7 +536,7 @@ class Space:
         url = self.workspace.serve("space.glb", content, "model/gltf-binary")
         T, K = shot.projection
         depth = float(shot.require_result().centre(T)[2])
-        metres = UNITS[mesh_unit(shot.require_result().registrar.bank.mesh) or "m"]
+        metres = UNITS[shot.require_result().registrar.bank.mesh.unit or "m"]
         H, W = shot.size
         corners = [(-0.5, -0.5), (W - 0.5, -0.5), (W - 0.5, H - 0.5), (-0.5, H - 0.5)]
         rays = [

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from ..geometry import rotation_error
 from ..matching import ViewDescriber
-from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.confidence import two_decimals
 from ..registration.photograph import Photograph, as_photograph
@@ -281,9 +280,9 @@ def _draw_caption(
     draw.text((x + size / 2, y + 0.8 * size), badge, PAPER, font, anchor="lm")
     mesh = registrar.bank.mesh
     front = None if result.prior is None else result.prior.front
-    pose = pose_in_words(result.rotation, up=mesh_up(mesh), front=front)
+    pose = pose_in_words(result.rotation, up=mesh.up, front=front)
     if result.translation is not None:
-        pose += f", {float(f'{result.distance:.3g}'):g} {mesh_unit(mesh) or 'units'} away"
+        pose += f", {float(f'{result.distance:.3g}'):g} {mesh.unit or 'units'} away"
     if registrar.others:
         pose = f"mesh {result.mesh_index}, {pose}"
     room = draw.im.size[0] - right - 1.5 * size

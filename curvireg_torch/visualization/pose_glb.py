@@ -11,11 +11,12 @@ from PIL import Image
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..mesh.colours import colours_at, surface_colours
-from ..mesh.mesh import mesh_centre, mesh_radius, mesh_unit
+from ..mesh import Mesh, as_mesh, mesh_centre, mesh_radius
+from ..mesh.colours import colours_at
 from ..utils.aliases import Fields
 from ..utils.checks import check_camera_matrix, check_photograph, check_pose, check_tensor
 from ..utils.choices import UNITS
+from ..utils.likes import MeshLike
 from ..utils.srgb import linear_colours
 from .encoding import jpeg, shrink, to_uint8
 
@@ -30,7 +31,7 @@ _MATT = {
 
 
 def pose_glb(
-    mesh: trimesh.Trimesh, T_cam_from_model: Tensor, camera_matrix: Tensor, image: Tensor
+    mesh: MeshLike, T_cam_from_model: Tensor, camera_matrix: Tensor, image: Tensor
 ) -> bytes:
     """A GLB file: the mesh at its pose, a camera at the origin, and the photograph on a plane
     behind the mesh.
@@ -40,7 +41,7 @@ def pose_glb(
     "photograph". Textures become colours of vertices.
 
     Args:
-        mesh: from :func:`curvireg_torch.load_mesh`, with its unit in ``mesh.units``.
+        mesh: from :func:`curvireg_torch.load_mesh`, with its unit.
         T_cam_from_model, camera_matrix: (4, 4), OpenCV camera, in the mesh's unit; (3, 3) px.
         image: (1 or 3, H, W) floating in [0, 1] or uint8.
 
@@ -56,10 +57,10 @@ def pose_glb(
     """
     check_tensor(T_cam_from_model, "T_cam_from_model", (4, 4))
     check_pose(T_cam_from_model, "T_cam_from_model")
-    return scene_glb(mesh, T_cam_from_model, [(torch.eye(4), camera_matrix, image)])
+    return scene_glb(as_mesh(mesh), T_cam_from_model, [(torch.eye(4), camera_matrix, image)])
 
 
-def mesh_glb(mesh: trimesh.Trimesh, transform: Tensor) -> bytes:
+def mesh_glb(mesh: Mesh, transform: Tensor) -> bytes:
     """A GLB file of the mesh alone, moved by a (4, 4) transform to glTF's axes and metres."""
     scene = trimesh.Scene()
     scene.add_geometry(_coloured(mesh), transform=transform.numpy())
@@ -67,14 +68,14 @@ def mesh_glb(mesh: trimesh.Trimesh, transform: Tensor) -> bytes:
 
 
 def scene_glb(
-    mesh: trimesh.Trimesh,
+    mesh: Mesh,
     T_world_from_model: Tensor,
     cameras: Sequence[tuple[Tensor, Tensor, Tensor]],
 ) -> bytes:
     """:func:`pose_glb` of a pose in the world and of cameras: ``T_cam_from_world``, camera matrix
     and photograph."""
     T = T_world_from_model.detach().cpu().double()
-    unit = mesh_unit(mesh) or "m"
+    unit = mesh.unit or "m"
     metres = UNITS[unit]
     scale = np.diag([metres, metres, metres, 1.0])
     scene = trimesh.Scene()
@@ -138,12 +139,12 @@ def _make_matt(tree: Fields) -> None:
             part.setdefault("material", len(tree["materials"]) - 1)
 
 
-def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def _coloured(mesh: Mesh) -> trimesh.Trimesh:
     """The mesh with vertex colours; faces share no vertices, so that edges stay sharp."""
     faces = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
-    plain = trimesh.Trimesh(np.asarray(mesh.triangles).reshape(-1, 3), faces, process=False)
+    plain = trimesh.Trimesh(mesh.vertices[mesh.faces].reshape(-1, 3), faces, process=False)
     rgb = np.full(3, 190 / 255)
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     if colours is not None:
         index = np.arange(len(faces), dtype=np.int32)
         zero = np.zeros(len(faces), np.float32)

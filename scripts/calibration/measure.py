@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import groupby
 from multiprocessing import get_context
 from pathlib import Path
@@ -23,7 +24,6 @@ from curvireg_torch.errors import LostObjectError
 from curvireg_torch.evidence import Evidence
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.crops import box_iou
-from curvireg_torch.inspection.photographs import without_colours
 from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
 from curvireg_torch.registration import Follower, camera, judging
 from curvireg_torch.registration.confidence import are_near
@@ -236,7 +236,7 @@ def is_grey(kind: str, obj_id: int) -> bool:
 def mesh_of(path: Path, *, grey: bool) -> trimesh.Trimesh:
     """The mesh in a file, ``grey`` without its colours."""
     mesh = cr.load_mesh(path, unit="mm")
-    return without_colours(mesh) if grey else mesh
+    return replace(mesh, colours=None) if grey else mesh
 
 
 def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:

@@ -25,13 +25,11 @@ from curvireg_torch.inspection.photographs import (
     photographed_mesh,
     trial_camera,
     with_print,
-    without_colours,
 )
 from curvireg_torch.inspection.report import Inspection
 from curvireg_torch.inspection.surface import look_symmetries
 from curvireg_torch.inspection.trial import Expected, Outcome, Trial, run_trial
 from curvireg_torch.matching import ViewBank
-from curvireg_torch.mesh import has_colours
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.registration import Registrar
 from curvireg_torch.synthetic import example_mesh
@@ -256,10 +254,9 @@ def test_a_print_varies_over_the_surface_and_leaves_the_shape():
     mesh = trimesh.creation.cylinder(1.0, 3.0)
     mesh.units = "cm"
     printed = with_print(mesh)
-    assert has_colours(printed)
-    assert printed.units == "cm"
+    assert printed.has_colours
+    assert printed.unit == "cm"
     assert printed.bounds == pytest.approx(mesh.bounds)
-    assert not has_colours(without_colours(printed))
 
 
 def test_ranges_take_their_last_border_in():
@@ -275,22 +272,22 @@ def test_ranges_take_their_last_border_in():
 @pytest.mark.parametrize("is_coloured", [False, True])
 def test_photographs_of_many_faces_show_a_simplified_mesh(monkeypatch, is_coloured):
     fine = trimesh.creation.icosphere(5, 2.0)
-    assert photographed_mesh(fine) is fine
-    fine = fine.copy()
     if is_coloured:
         colours = np.where(fine.triangles_center[:, :1] > 0.0, (250, 0, 0, 255), (0, 0, 250, 255))
         fine.visual.face_colors = colours
     fine.units = "cm"
-    fine = as_mesh(fine)
+    fine = replace(as_mesh(fine), up="y")
+    assert photographed_mesh(fine) is fine
     for name, value in (("MANY_FACES", 9_000), ("COLOURED_FACES", 2_000)):
         monkeypatch.setattr(f"curvireg_torch.inspection.photographs.{name}", value)
     simple = photographed_mesh(fine)
     assert len(simple.faces) <= (2_000 if is_coloured else 8_000)
     assert simple.bounds == pytest.approx(fine.bounds, abs=0.05)
-    assert has_colours(simple) == is_coloured
+    assert simple.has_colours == is_coloured
+    assert (simple.unit, simple.up) == ("cm", "y")
     if is_coloured:
-        reds = simple.visual.vertex_colors[:, 0] > 125
-        sides = simple.vertices[:, 0]
+        reds = simple.colours.corners[..., 0] > 125
+        sides = simple.vertices[simple.faces][..., 0]
         assert (reds == (sides > 0.0))[np.abs(sides) > 0.1].all()
 
 
@@ -424,11 +421,11 @@ def test_a_print_tells_sides_of_a_box_apart_and_a_plain_one_does_not():
 
 @pytest.mark.slow
 def test_a_printed_can_is_predicted_better_with_its_texture_than_without():
-    printed = as_mesh(with_print(trimesh.creation.cylinder(0.033, 0.12)))
+    printed = with_print(trimesh.creation.cylinder(0.033, 0.12))
     views = cr.sample_views(azimuth_step=30, elevations=[-60, -30, 0, 30, 60])
     generate = PhotographGenerator(printed, 2, upright=True)
     right = {}
-    for name, mesh in (("texture", printed), ("grey", without_colours(printed))):
+    for name, mesh in (("texture", printed), ("grey", replace(printed, colours=None))):
         bank = ViewBank.build(mesh, views, progress=False)
         registrar = Registrar(bank, mesh_is="exact", symmetries=torch.eye(4)[None].double())
         right[name] = run_trial(registrar, generate, 6, compare=False).expected.right

@@ -70,7 +70,7 @@ def test_m3t_reads_the_pose_in_metres_and_the_mesh_in_its_unit(tmp_path):
     np.testing.assert_array_equal(body.getNode("geometry2body_pose").mat(), np.eye(4))
     mesh = load_mesh(tmp_path / body.getNode("geometry_path").string(), unit="mm")
     np.testing.assert_allclose(mesh.bounds, box().bounds)
-    assert mesh.volume == pytest.approx(box().volume)
+    assert mesh.surface.volume == pytest.approx(box().volume)
 
 
 def test_m3t_shows_both_sides_of_an_open_surface(tmp_path):

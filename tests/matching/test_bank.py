@@ -17,7 +17,7 @@ from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.matching import bank as bank_module
 from curvireg_torch.matching.describe import view_mesh
-from curvireg_torch.mesh import mesh_symmetries, reflections, symmetry
+from curvireg_torch.mesh import MeshWarning, mesh_symmetries, reflections, symmetry
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.mesh.reflections import reflection_plane
 from curvireg_torch.pipeline import Pipeline, ViewPolicy
@@ -79,6 +79,21 @@ def test_check_compatible_refuses_another_view_policy(truck):
                 constructor(upright, pipeline=other)
 
 
+def test_a_file_keeps_what_is_known_of_the_mesh(small_bank, tmp_path):
+    known = {
+        "unit": "in",
+        "up": "-y",
+        "warnings": (MeshWarning("stray", "far away"),),
+        "file_name": "truck.ply",
+    }
+    mesh = replace(small_bank.mesh, **known)
+    bank = ViewBank(mesh, small_bank.views, small_bank.pipeline, small_bank.tensors)
+    bank.save(tmp_path / "bank.safetensors")
+    loaded = ViewBank.load(tmp_path / "bank.safetensors").mesh
+    assert {name: getattr(loaded, name) for name in known} == known
+    assert {"extreme_points", "mesh_symmetries", "reflection_plane"} <= set(loaded.measures)
+
+
 def test_save_and_load(small_bank, tmp_path):
     path = tmp_path / "new" / "bank.safetensors"
     small_bank.save(path)
@@ -86,7 +101,7 @@ def test_save_and_load(small_bank, tmp_path):
     assert_same(loaded, small_bank, atol=5e-4)
     np.testing.assert_array_equal(loaded.mesh.vertices, small_bank.mesh.vertices)
     np.testing.assert_array_equal(loaded.mesh.faces, small_bank.mesh.faces)
-    assert (loaded.mesh.units, [p.name for p in path.parent.iterdir()]) == ("m", [path.name])
+    assert (loaded.mesh.unit, [p.name for p in path.parent.iterdir()]) == ("m", [path.name])
     if os.name == "posix":
         mask = os.umask(0)
         os.umask(mask)
@@ -209,10 +224,10 @@ def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
         np.testing.assert_array_equal(
             getattr(view_mesh(mesh), part), getattr(view_mesh(bank.mesh), part)
         )
-    mesh.vertices *= 2.0
+    other = replace(mesh, surface=bank.mesh.surface)  # which has no measures yet
     for function in (extreme_points, mesh_symmetries, view_mesh):
         with pytest.raises(TypeError):
-            function(mesh)
+            function(other)
     tensors = load_file(path)
     tensors["view_mesh.faces"] += 10**6
     rewrite(path, tensors, checksum=tensor_checksum(tensors))

@@ -15,7 +15,7 @@ from PIL import Image
 from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewBank, bank_key, cache, cache_folder, cached_bank, list_cache
 from curvireg_torch.matching.cache import clear_cache
-from curvireg_torch.mesh.mesh import as_mesh, mesh_unit, mesh_warnings
+from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.pipeline import BankSettings, Pipeline
 
 PIPELINE = Pipeline(bank=BankSettings(image_size=64))
@@ -41,9 +41,7 @@ def textured(*, uv=0.0, level=0, side=4):
 
 
 def standing(up="y"):
-    mesh = trimesh.creation.box()
-    mesh.metadata["up"] = up
-    return mesh
+    return replace(as_mesh(trimesh.creation.box()), up=up)
 
 
 def test_bank_key_depends_on_everything(monkeypatch):
@@ -66,14 +64,14 @@ def test_bank_key_depends_on_everything(monkeypatch):
 def test_bank_of_another_unit_is_not_rendered_again(tmp_path, monkeypatch):
     options = {"pipeline": PIPELINE, "folder": tmp_path, "progress": False}
     mesh = trimesh.creation.box()
-    assert mesh_unit(cached_bank(mesh, VIEWS, **options).mesh) is None
+    assert cached_bank(mesh, VIEWS, **options).mesh.unit is None
     monkeypatch.setattr(ViewBank, "build", None)  # would fail
     for unit in ("mm", "m"):
         mesh.units = unit
         bank = cached_bank(mesh, VIEWS, **options)
-        assert mesh_unit(bank.mesh) == unit
+        assert bank.mesh.unit == unit
     mesh = trimesh.creation.box()
-    assert mesh_unit(cached_bank(mesh, VIEWS, **options).mesh) is None
+    assert cached_bank(mesh, VIEWS, **options).mesh.unit is None
     assert len(list_cache(tmp_path)) == 1
 
 
@@ -87,7 +85,7 @@ def test_a_bank_from_the_cache_has_the_warnings_of_this_mesh(tmp_path):
         for mesh in (ball, with_leftover, ball)
     ]
     assert len(list_cache(tmp_path)) == 1
-    kinds = [[warning.kind for warning in mesh_warnings(mesh)] for mesh in found]
+    kinds = [[warning.kind for warning in mesh.warnings] for mesh in found]
     assert kinds == [[], ["stray"], []]
 
 
@@ -99,14 +97,15 @@ def test_cached_bank_is_loaded_the_second_time(tmp_path, monkeypatch):
     for mesh, bank in zip(meshes, banks, strict=True):
         again = cached_bank(mesh, VIEWS, **options)
         assert torch.equal(again.descriptors, bank.descriptors)
-        found = again.mesh.metadata
-        given = as_mesh(mesh).metadata
-        assert (found["up"], "colours" in found) == (given["up"], "colours" in given)
-        if "colours" in given:
-            np.testing.assert_array_equal(found["colours"].uv, given["colours"].uv)
-            np.testing.assert_array_equal(
-                found["colours"].textures[0], given["colours"].textures[0]
-            )
+        found = ViewBank.load(next(iter(list_cache(tmp_path))).path).mesh
+        given = as_mesh(mesh)
+        assert found.up == again.mesh.up == given.up
+        if given.colours is None:
+            assert found.colours is again.mesh.colours is None
+        else:
+            for colours in (found.colours, again.mesh.colours):
+                np.testing.assert_array_equal(colours.uv, given.colours.uv)
+                np.testing.assert_array_equal(colours.textures[0], given.colours.textures[0])
 
 
 def test_cached_bank_replaces_damaged_and_mislabelled_files(tmp_path):

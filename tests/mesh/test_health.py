@@ -7,13 +7,7 @@ import pytest
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch.mesh import (
-    has_colours,
-    mesh_centre,
-    mesh_radius,
-    mesh_symmetries,
-    mesh_warnings,
-)
+from curvireg_torch.mesh import Mesh, mesh_centre, mesh_radius, mesh_symmetries
 from curvireg_torch.mesh.colours import SurfaceColours
 from curvireg_torch.mesh.health import stray_faces
 from curvireg_torch.mesh.mesh import as_mesh
@@ -55,17 +49,17 @@ def test_left_over_parts_do_not_set_the_box(scale, at):
     np.testing.assert_allclose(mesh.extents, np.array(SIDES) * scale)
     assert mesh_radius(mesh) == pytest.approx(0.5 * float(np.linalg.norm(SIDES)) * scale)
     assert mesh_centre(mesh).abs().max() < 1e-9 * scale
-    (warning,) = mesh_warnings(mesh)
+    (warning,) = mesh.warnings
     assert warning.kind == "stray"
     assert "of 14 faces 2 near" in warning.text
-    assert mesh_warnings(as_mesh(mesh)) == (warning,), "told once"
+    assert as_mesh(mesh).warnings == (warning,), "told once"
 
 
 def test_colours_stay_with_their_faces():
     whole = joined(triangle(1.0, (300.0, 0.0, 0.0)), box())
     colours = np.arange(39, dtype=np.uint8).reshape(13, 3) * 6
     whole.visual = trimesh.visual.ColorVisuals(whole, face_colors=colours)
-    found = as_mesh(whole).metadata["colours"]
+    found = as_mesh(whole).colours
     np.testing.assert_array_equal(found.corners[:, 0], colours[1:])
 
 
@@ -103,7 +97,7 @@ def test_colours_stay_with_their_faces():
 def test_parts_that_belong_to_the_object_stay(whole):
     assert not stray_faces(whole).any()
     mesh = as_mesh(whole)
-    assert (len(mesh.faces), mesh_warnings(mesh)) == (len(whole.faces), ())
+    assert (len(mesh.faces), mesh.warnings) == (len(whole.faces), ())
 
 
 def test_a_tiny_part_inside_the_box_stays():
@@ -136,7 +130,7 @@ def test_coordinates_of_maps(tmp_path, load, suffix):
         )
     else:
         assert "rounded to steps of 0.5" in texts[0]
-        assert [warning.kind for warning in mesh_warnings(mesh)] == ["precision"]
+        assert [warning.kind for warning in mesh.warnings] == ["precision"]
     near = trimesh.creation.icosphere(3, 40.123)
     near.export(tmp_path / f"b.{suffix}")
     assert not load(tmp_path / f"b.{suffix}", unit="mm")[1]
@@ -152,13 +146,13 @@ def test_colours_that_do_not_vary_are_none():
     faces = len(trimesh.creation.cylinder(30.0, 100.0, sections=96).faces)
     for shade in (0, 100, 255):
         mesh = coloured(face_colors=np.full((faces, 3), shade, np.uint8))
-        assert not has_colours(mesh)
+        assert not mesh.has_colours
         assert len(mesh_symmetries(mesh)) == 72
     noise = np.random.default_rng(0).integers(0, 8, (faces, 3), np.uint8) + 100
-    assert not has_colours(coloured(face_colors=noise))
+    assert not coloured(face_colors=noise).has_colours
     one = np.full((faces, 3), 100, np.uint8)
     one[:3, 2] = 130  # 3 faces, 1 % of the surface
-    assert has_colours(coloured(face_colors=one))
+    assert coloured(face_colors=one).has_colours
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.0005, 0.01, 0.5])
@@ -172,8 +166,8 @@ def test_a_texture_counts_if_a_word_of_it_differs(fraction):
     )
     uv = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32)
     corners = np.full((2, 3, 3), 255, np.uint8)
-    mesh.metadata["colours"] = SurfaceColours(corners, uv, np.zeros(2, np.int32), (texture,))
-    assert has_colours(mesh) == (fraction > 0.002)
+    colours = SurfaceColours(corners, uv, np.zeros(2, np.int32), (texture,))
+    assert Mesh(mesh, colours=colours).has_colours == (fraction > 0.002)
 
 
 def test_notes_reach_the_result(tmp_path):

@@ -1,5 +1,6 @@
 import pickle
 import warnings
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -11,13 +12,7 @@ import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.mesh import normalization_transform
 from curvireg_torch.mesh.edges import MeshEdges, encloses_volumes, simplified
-from curvireg_torch.mesh.mesh import (
-    as_mesh,
-    extreme_points,
-    measures_of,
-    mesh_up,
-    principal_rotation,
-)
+from curvireg_torch.mesh.mesh import as_mesh, extreme_points, principal_rotation
 from curvireg_torch.rendering.contours import MeshContours
 
 
@@ -74,9 +69,9 @@ def test_load_mesh_notes_the_up_axis(tmp_path, suffix, up):
     path = tmp_path / f"a.{suffix}"
     trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
     mesh = cr.load_mesh(path)
-    assert mesh_up(mesh) == mesh_up(as_mesh(mesh)) == up
+    assert mesh.up == as_mesh(mesh).up == up
     np.testing.assert_allclose(mesh.extents, [1, 2, 3], rtol=1e-6)  # not rotated
-    assert mesh_up(cr.load_mesh(path, up="-x")) == "-x"
+    assert cr.load_mesh(path, up="-x").up == "-x"
     with pytest.raises(InvalidInputError, match="up: expected one of 'x'"):
         cr.load_mesh(path, up="w")
 
@@ -193,8 +188,8 @@ def test_a_degenerate_face_takes_no_colours_away(tmp_path):
         f"mtllib a.mtl\n{points}usemtl a\nf 1 1 2\nf 1 2 3\nusemtl b\nf 2 4 3\n"
     )
     mesh = cr.load_mesh(tmp_path / "a.obj")
-    assert cr.mesh.has_colours(mesh)
-    assert mesh.metadata["colours"].corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
+    assert mesh.has_colours
+    assert mesh.colours.corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
 
 
 def test_bytes_of_the_files_beside_a_mesh_are_bounded_together(tmp_path, monkeypatch):
@@ -210,19 +205,46 @@ def test_bytes_of_the_files_beside_a_mesh_are_bounded_together(tmp_path, monkeyp
         cr.load_mesh(path)
 
 
-def test_measures_are_those_of_the_mesh_as_it_is_now():
-    mesh = trimesh.creation.box((1.0, 2.0, 3.0))
+def test_a_mesh_keeps_its_measures_and_callers_have_copies():
+    mesh = as_mesh(trimesh.creation.box((1.0, 2.0, 3.0)))
     extreme_points(mesh).zero_()
     points = extreme_points(mesh)
-    assert points.abs().max() == 1.5, "callers have copies"
-    known = measures_of(pickle.loads(pickle.dumps(mesh)))
+    assert points.abs().max() == 1.5
+    known = pickle.loads(pickle.dumps(mesh)).measures
     assert torch.equal(known["extreme_points"], points), "they travel with the mesh"
-    measures_of(mesh)["view_mesh"] = mesh  # one that needs no simplification
-    other = mesh.copy()
-    assert measures_of(other) is measures_of(mesh), "copies have the same"
-    other.vertices *= 3.0
-    assert torch.equal(extreme_points(other), 3.0 * points)
-    assert torch.equal(extreme_points(mesh), points)
-    mesh.vertices *= 2.0
-    assert measures_of(mesh) == {}
+    mesh.measures["extreme_points"] = 2.0 * points
     assert torch.equal(extreme_points(mesh), 2.0 * points)
+    assert torch.equal(extreme_points(mesh.surface), points)
+    assert replace(mesh, up="y").measures == {}, "another mesh has its own"
+
+
+def test_a_mesh_does_not_change_with_what_it_was_made_of():
+    box = trimesh.creation.box((1.0, 2.0, 3.0))
+    box.visual.face_colors = np.repeat([[250, 0, 0, 255], [0, 0, 250, 255]], 6, axis=0)
+    mesh = as_mesh(box)
+    assert mesh.has_colours
+    vertices = mesh.vertices.copy()
+    box.vertices[:] *= 2.0
+    box.apply_scale(3.0)
+    box.visual.face_colors[:] = 0
+    np.testing.assert_array_equal(mesh.vertices, vertices)
+    assert mesh.colours.corners.max() == 250
+    assert as_mesh(mesh) is mesh
+    with pytest.raises(FrozenInstanceError):
+        mesh.up = "y"
+    for change in ({"up": "w"}, {"unit": "miles"}):
+        with pytest.raises(InvalidInputError, match=f"{next(iter(change))}: expected one of"):
+            replace(mesh, **change)
+    assert not replace(mesh, colours=None).has_colours
+    assert not replace(
+        mesh, colours=replace(mesh.colours, corners=0 * mesh.colours.corners)
+    ).has_colours
+
+
+@pytest.mark.parametrize(
+    ("units", "unit"), [("millimeters", "mm"), ("in", "in"), (None, None), ("miles", None)]
+)
+def test_as_mesh_keeps_the_unit_of_trimesh(units, unit):
+    box = trimesh.creation.box()
+    box.units = units
+    assert as_mesh(box).unit == unit

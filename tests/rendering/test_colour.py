@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
-from curvireg_torch.mesh import has_colours, load_mesh, surface_colours
+from curvireg_torch.mesh import as_mesh, load_mesh
 from curvireg_torch.mesh.colours import colours_at
 from curvireg_torch.rendering import make_renderer, render_colour, shade
 from tests._support.numbers import double
@@ -96,11 +98,11 @@ def test_render_colour_shows_the_texture_of_every_side(view, orthographic):
 
 
 def test_render_colour_is_grey_without_colours_or_faces():
-    mesh = textured_box()
+    mesh = as_mesh(textured_box())
     T = camera(20.0, 30.0)
-    bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    assert has_colours(mesh)
-    assert not has_colours(bare)
+    bare = replace(mesh, colours=None)
+    assert mesh.has_colours
+    assert not bare.has_colours
     grey = render_colour(bare, T, K, SIZE)
     assert (grey[:, 0] == grey[:, 1]).all()
     assert (grey - render_colour(mesh, T, K, SIZE)).abs().mean() > 0.05
@@ -148,21 +150,20 @@ def test_load_mesh_reads_textures_and_materials(tmp_path, suffix):
     path = tmp_path / f"two{suffix}"
     scene.export(path)
     mesh = load_mesh(path, up="z")
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     assert len(colours) == len(mesh.faces) == 24
     assert len(colours.textures) == 1
-    is_red = mesh.triangles_center[:, 0] > 1.0
+    centres = mesh.surface.triangles_center
+    is_red = centres[:, 0] > 1.0
     assert is_red.sum() == 12
     centre = np.full(24, 1 / 3, np.float32)
     found = colours_at(colours, np.arange(24, dtype=np.int32), centre, centre)
     np.testing.assert_allclose(found[is_red], np.tile([1.0, 124 / 255, 0.0], (12, 1)), atol=0.005)
     box = textured_box()
-    expected = surface_colours(box)
+    expected = as_mesh(box).colours
     assert expected is not None
     by_centre = {tuple(np.round(c, 4)): i for i, c in enumerate(box.triangles_center)}
-    match = np.array(
-        [by_centre[tuple(np.round(c, 4))] for c in mesh.triangles_center[~is_red]], np.int32
-    )
+    match = np.array([by_centre[tuple(np.round(c, 4))] for c in centres[~is_red]], np.int32)
     np.testing.assert_allclose(
         found[~is_red], colours_at(expected, match, centre[:12], centre[:12]), atol=0.02
     )

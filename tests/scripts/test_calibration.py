@@ -9,7 +9,6 @@ import torch
 pytest.importorskip("sklearn")
 
 from curvireg_torch.geometry.framing import outside_fraction
-from curvireg_torch.mesh import has_colours
 from curvireg_torch.synthetic import example_mesh
 from scripts.benchmark.make import TWIN, Shapes, Tied, Twins
 from scripts.calibration import fits, measure, sets
@@ -133,8 +132,8 @@ def test_level_of_few_rows_keeps_the_proportions_of_the_weights():
 def test_grey_meshes_have_no_colours(tmp_path):
     path = tmp_path / "painted.glb"
     example_mesh(painted=True).export(path)
-    assert has_colours(measure.mesh_of(path, grey=False))
-    assert not has_colours(measure.mesh_of(path, grey=True))
+    assert measure.mesh_of(path, grey=False).has_colours
+    assert not measure.mesh_of(path, grey=True).has_colours
     assert measure.is_grey("shelves", 4)
     assert not measure.is_grey("shelves", 3)
     assert not measure.is_grey("wrong", 4)

@@ -192,7 +192,7 @@ def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(worksp
     session.set_limits(front=None)
     assert click("up", 0.1, 0.9, 0.2) == ("y", None)
     assert click("up", 0, 0, -1.0) == ("-y", None)
-    assert session.mesh.metadata["up"] == "-y"
+    assert session.mesh.up == "-y"
     assert click("front", 0, 0, 1.0) == ("-y", None), "what is up is not the front"
 
 

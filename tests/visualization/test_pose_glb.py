@@ -11,6 +11,7 @@ import trimesh
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import project_points, rotation_from_axis_angle
+from curvireg_torch.mesh import as_mesh
 from curvireg_torch.visualization import pose_glb
 from curvireg_torch.visualization.pose_glb import scene_glb
 from tests._support.scenes import CAMERA, SIZE, scene
@@ -108,7 +109,7 @@ def test_scene_glb_places_each_camera_where_its_photograph_was_taken():
         ).double()
         pose[:3, 3] = torch.tensor(shift)
         poses.append(pose)
-    data = scene_glb(mesh, T, [(pose, K, image) for pose in poses])
+    data = scene_glb(as_mesh(mesh), T, [(pose, K, image) for pose in poses])
     tree = tree_of(data)
     back = trimesh.load(BytesIO(data), file_type="glb")
     name = next(

@@ -9,7 +9,7 @@ import trimesh
 
 from ...errors import InvalidInputError
 from ...utils.aliases import Document
-from ...utils.arrays import Floats
+from ...utils.arrays import Floats, Integers
 from ...utils.choices import UNITS
 from ...utils.files import write_file
 
@@ -27,7 +27,7 @@ FLAT_ANGLE = 1e-3  # radians between triangles that are one polygon
 def write_m3t(
     out: Path,
     vertices: Floats,
-    faces: Floats,
+    faces: Integers,
     document: Document,
     *,
     is_closed: bool,
@@ -72,7 +72,7 @@ def _opencv_matrix(T: Floats) -> str:
     return f"!!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: d\n  data: [{numbers}]"
 
 
-def write_visp(out: Path, vertices: Floats, faces: Floats, document: Document) -> None:
+def write_visp(out: Path, vertices: Floats, faces: Integers, document: Document) -> None:
     """Write the ``VISP_FILES`` into the folder ``out``; arguments and errors are those of
     :func:`write_m3t`. Coplanar triangles are one polygon."""
     T, metres = _pose_in_metres(document, "visp")

@@ -135,24 +135,9 @@ def colours_of_parts(meshes: Iterable[Any]) -> list[SurfaceColours | None]:
     return found
 
 
-def surface_colours(mesh: Any) -> SurfaceColours | None:
-    """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are
-    white. They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else
-    from ``mesh.visual``.
-
-    Example:
-        >>> from curvireg_torch.synthetic import example_mesh
-        >>> mesh = example_mesh(painted=True)
-        >>> len(surface_colours(mesh)) == len(mesh.faces)
-        True
-    """
-    return _surface_colours(mesh, {})
-
-
 def _surface_colours(mesh: Any, known: _Textures) -> SurfaceColours | None:
-    colours = mesh.metadata.get("colours")
-    if isinstance(colours, SurfaceColours) and len(colours) == len(mesh.faces):
-        return colours
+    """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are
+    white."""
     visual = mesh.visual
     faces = np.asarray(mesh.faces)
     painting = Painting(len(faces))

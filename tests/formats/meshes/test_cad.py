@@ -13,7 +13,6 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError, MissingDependencyError
 from curvireg_torch.formats.meshes import cad
 from curvireg_torch.formats.meshes.files import mesh_files
-from curvireg_torch.mesh import has_colours, mesh_up, surface_colours
 from curvireg_torch.utils import extras
 from curvireg_torch.utils.extras import is_installed
 from tests.formats.meshes.step import iges_file, step_file
@@ -31,9 +30,9 @@ def test_step_files_keep_their_unit_and_axes(tmp_path, load, unit, suffix):
     path = tmp_path / f"part.{suffix}"
     path.write_text(step_file((3.0, 2.0, 1.0), unit))
     mesh, texts = load(path)
-    assert (mesh.units, mesh_up(mesh), texts) == (unit, "z", [])
+    assert (mesh.unit, mesh.up, texts) == (unit, "z", [])
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 2, 1]], atol=1e-6)
-    assert mesh.volume == pytest.approx(6.0, rel=1e-6)
+    assert mesh.surface.volume == pytest.approx(6.0, rel=1e-6)
     with pytest.raises(
         MeshError, match=f"the file states its unit, {unit}, which is not 'dm'; leave the unit out"
     ):
@@ -44,7 +43,7 @@ def test_step_files_keep_their_unit_and_axes(tmp_path, load, unit, suffix):
 @pytest.mark.parametrize(("flag", "name", "unit"), [(2, "MM", "mm"), (1, "IN", "in")])
 def test_iges_files_keep_their_unit(write, load, flag, name, unit):
     mesh, _ = load(write("part.igs", iges_file((3.0, 2.0), flag, name)))
-    assert mesh.units == unit
+    assert mesh.unit == unit
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 2, 0]], atol=1e-5)
 
 
@@ -182,9 +181,9 @@ def test_collada_files_keep_their_unit_and_axes(tmp_path, load, asset, unit, up,
     pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "label.png")
     mesh, texts = load(tmp_path / "a.dae")
-    assert (mesh.units, mesh_up(mesh), texts) == (unit, up, [])
+    assert (mesh.unit, mesh.up, texts) == (unit, up, [])
     np.testing.assert_allclose(mesh.bounds, np.array([[10, 0, 0], [14, 2, 0]]) * scale, atol=1e-6)
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     np.testing.assert_array_equal(colours.textures[0], pixels)
     np.testing.assert_allclose(colours.uv[0], [[0, 0], [1, 0], [0, 1]], atol=1e-6)
     assert tmp_path / "label.png" in mesh_files(tmp_path / "a.dae")
@@ -199,7 +198,7 @@ def test_collada_names_textures_that_it_cannot_use(tmp_path, write, load):
         ("label.png", "not an image"),
     ):
         mesh, texts = load(write("a.dae", collada(image=image)))
-        assert not has_colours(mesh)
+        assert not mesh.has_colours
         assert match in " ".join(texts)
 
 
@@ -279,9 +278,9 @@ def test_threemf_places_objects_and_their_components(tmp_path, load):
     resources = solid(1) + f'<object id="2"><components>{components}</components></object>'
     items = '<item objectid="2" transform="1 0 0 0 0 1 0 -1 0 0 0 5"/>'
     mesh, texts = load(threemf(tmp_path / "a.3mf", resources, items))
-    assert (mesh.units, mesh_up(mesh), len(mesh.faces), texts) == ("in", "z", 24, [])
+    assert (mesh.unit, mesh.up, len(mesh.faces), texts) == ("in", "z", 24, [])
     np.testing.assert_allclose(mesh.bounds, [[-15, -5, -10], [110, 5, 20]])
-    assert mesh.volume == pytest.approx(2 * 6000)
+    assert mesh.surface.volume == pytest.approx(2 * 6000)
     with pytest.raises(MeshError, match="states its unit, in"):
         cr.load_mesh(tmp_path / "a.3mf", unit="mm")
     for unit, name, scale in (
@@ -290,7 +289,7 @@ def test_threemf_places_objects_and_their_components(tmp_path, load):
         ('unit="meter"', "m", 1.0),
     ):
         mesh, _ = load(threemf(tmp_path / "a.3mf", solid(1), unit=unit))
-        assert (mesh.units, mesh.extents[0]) == (name, pytest.approx(30.0 * scale))
+        assert (mesh.unit, mesh.extents[0]) == (name, pytest.approx(30.0 * scale))
 
 
 def test_threemf_leaves_out_what_is_not_the_object(tmp_path, load):
@@ -325,7 +324,7 @@ def test_threemf_reads_colours_and_textures(tmp_path, load):
     )
     resources = f"{base}</basematerials>" + solid(1, 'pid="5" pindex="1"', 'pid="5" p1="0"')
     mesh, _ = load(threemf(tmp_path / "a.3mf", resources))
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     assert (colours.corners[:6] == [255, 0, 0]).all()
     assert (colours.corners[6:] == [0, 0, 255]).all()
     group = (
@@ -337,11 +336,11 @@ def test_threemf_reads_colours_and_textures(tmp_path, load):
             group + solid(1, "", 'pid="6" p1="0" p2="1" p3="0"'),
         )
     )
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
     # a corner without an entry has that of the first
     few = group + solid(1, "", 'pid="6" p1="0" p2="1"')
-    colours = surface_colours(load(threemf(tmp_path / "a.3mf", few))[0])
+    colours = load(threemf(tmp_path / "a.3mf", few))[0].colours
     assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
     pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "a.png")
@@ -357,7 +356,7 @@ def test_threemf_reads_colours_and_textures(tmp_path, load):
     resources = texture + solid(1, "", 'pid="8" p1="0" p2="1" p3="2"')
     pictures = {"3D/a.png": (tmp_path / "a.png").read_bytes()}
     mesh, texts = load(threemf(tmp_path / "a.3mf", resources, more=pictures))
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     assert not texts
     np.testing.assert_array_equal(colours.textures[0], pixels)
     assert colours.uv[0].tolist() == [[0, 0], [1, 0], [0, 1]]
@@ -368,8 +367,8 @@ def test_threemf_reads_colours_and_textures(tmp_path, load):
 
 def test_an_axis_that_is_given_comes_before_that_of_the_file(tmp_path):
     path = threemf(tmp_path / "a.3mf", solid(1))
-    assert mesh_up(cr.load_mesh(path)) == "z"
-    assert mesh_up(cr.load_mesh(path, up="-y")) == "-y"
+    assert cr.load_mesh(path).up == "z"
+    assert cr.load_mesh(path, up="-y").up == "-y"
 
 
 def test_threemf_of_several_models(tmp_path, load):
@@ -440,7 +439,7 @@ def robot(folder, base="package://arm/meshes/base.stl"):
 
 def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path, load):
     mesh, texts = load(robot(tmp_path))
-    assert (mesh.units, mesh_up(mesh), texts) == ("m", "z", [])
+    assert (mesh.unit, mesh.up, texts) == ("m", "z", [])
     # The tip's box of 0.3 x 0.2 x 0.1 is turned about z, lies 0.5 along z, and z is turned to x.
     np.testing.assert_allclose(mesh.bounds[0], [-1.5, -1.0, -0.5], atol=1e-6)
     assert mesh.bounds[1][0] == pytest.approx(3.25, abs=0.01)
@@ -448,7 +447,7 @@ def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path, load):
     np.testing.assert_allclose(tip.bounds, [[-0.1, -0.15, 0.45], [0.1, 0.15, 0.55]], atol=1e-6)
     names = {path.name for path in mesh_files(tmp_path / "arm.urdf")}
     assert names == {"arm.urdf", "base.stl", "tip.ply"}
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     assert (colours.corners[:12] == [0, 0, 255]).all()
     with pytest.raises(MeshError, match=r"no link 'hand'; it has base, tip, ball"):
         cr.load_mesh(tmp_path / "arm.urdf", link="hand")

@@ -14,7 +14,7 @@ from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
-from curvireg_torch.mesh import has_colours, mesh_symmetries, surface_colours
+from curvireg_torch.mesh import mesh_symmetries
 
 BOX = trimesh.creation.box((3.0, 2.0, 1.0))
 TYPES = {"f": 5126, "B": 5121, "H": 5123, "I": 5125, "b": 5120, "h": 5122}
@@ -80,8 +80,10 @@ def test_strips_have_all_their_faces_and_lines_none(tmp_path, load):
         tree.part(indices, square, mode=5)
         tree.part(None, square, mode=1)
         mesh, _ = load(tree.write(tmp_path / "a.gltf"))
-        assert (len(mesh.faces), mesh.area) == (2, 1.0)
-        assert (mesh.face_normals[:, 2] > 0.99).all(), "every second face of a strip is turned over"
+        assert (len(mesh.faces), mesh.surface.area) == (2, 1.0)
+        assert (mesh.surface.face_normals[:, 2] > 0.99).all(), (
+            "every second face of a strip is turned over"
+        )
 
 
 def sparse(tree, index, values, kind="B"):
@@ -108,12 +110,12 @@ def test_sparse_accessors_replace_some_of_their_values(tmp_path, load, kind):
     expected[moved] *= 3.0
     mesh, texts = load(tree.write(tmp_path / "a.gltf"))
     assert not texts
-    np.testing.assert_allclose(mesh.triangles, expected[BOX.faces], atol=1e-6)
+    np.testing.assert_allclose(mesh.surface.triangles, expected[BOX.faces], atol=1e-6)
     del accessor["bufferView"]
     accessor["sparse"] = sparse(tree, [*range(7)], BOX.vertices[:7], kind)
     expected = np.vstack([BOX.vertices[:7], np.zeros(3)])
     mesh, _ = load(tree.write(tmp_path / "b.gltf"))
-    np.testing.assert_allclose(mesh.triangles, expected[BOX.faces], atol=1e-6)
+    np.testing.assert_allclose(mesh.surface.triangles, expected[BOX.faces], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -148,9 +150,9 @@ def test_vertex_colours_are_multiplied_by_the_material(tmp_path, load, dtype, la
     metallic = {"metallicFactor": 0, **({} if factor is None else {"baseColorFactor": factor})}
     tree.content["materials"] = [{"pbrMetallicRoughness": metallic}]
     mesh, texts = load(tree.write(tmp_path / "a.gltf"))
-    found = surface_colours(mesh)
+    found = mesh.colours
     assert found is not None
-    assert has_colours(mesh)
+    assert mesh.has_colours
     assert not texts
     # sRGB
     tint = (
@@ -204,7 +206,7 @@ def test_transforms_and_other_sets_of_texture_coordinates(
             "KHR_texture_transform"
         ]
         mesh, texts = load(tree.write(tmp_path / "a.gltf"))
-        colours = surface_colours(mesh)
+        colours = mesh.colours
         assert not texts
         found = colours.uv[0].astype(float)
         found[:, 1] = 1 - found[:, 1]
@@ -272,7 +274,7 @@ def test_a_plain_material_is_no_print(tmp_path, load):
         tree.content["materials"] = [{"pbrMetallicRoughness": metallic}]
         mesh, texts = load(tree.write(tmp_path / "a.gltf"), unit="mm")
         assert not texts
-        assert not has_colours(mesh)
+        assert not mesh.has_colours
         assert len(mesh_symmetries(mesh)) == 72
 
 

@@ -158,13 +158,13 @@ def test_bytes_of_a_shared_image_are_made_once(tmp_path, monkeypatch):
     for count in (5, 10):
         decode.reset_mock()
         path.write_text(json.dumps(part_of_image(count, {"uri": f"data:image/png;base64,{coded}"})))
-        assert len(cr.load_mesh(path).metadata["colours"].textures) == 1
+        assert len(cr.load_mesh(path).colours.textures) == 1
         assert decode.call_count == 2  # the buffer and the image
         viewed.clear()
         buffers = [points, {"uri": f"data:;base64,{coded}", "byteLength": len(picture())}]
         shared = part_of_image(count, {"bufferView": 1}, buffers=buffers, bufferViews=views)
         path.write_text(json.dumps(shared))
-        assert len(cr.load_mesh(path).metadata["colours"].textures) == 1
+        assert len(cr.load_mesh(path).colours.textures) == 1
         assert viewed.count(1) == 1
 
 

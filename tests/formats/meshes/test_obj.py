@@ -11,7 +11,7 @@ from PIL import Image
 import curvireg_torch as cr
 from curvireg_torch.cli.options import MESH, add_options, register_options
 from curvireg_torch.errors import MeshError, MissingFileError
-from curvireg_torch.mesh import has_colours, mesh_symmetries, surface_colours
+from curvireg_torch.mesh import mesh_symmetries
 from tests._support.doubling import check_linear
 
 POINTS = "".join(f"v {x} {y} {z}\n" for x in (0, 3) for y in (0, 2) for z in (0, 1))
@@ -76,15 +76,15 @@ def test_materials_of_all_libraries_and_none_without_a_name(tmp_path, write, loa
         "mtllib a.mtl\nmtllib b c.mtl\n",
     ):
         mesh, texts = load(write("a.obj", head + body))
-        colours = surface_colours(mesh)
+        colours = mesh.colours
         assert not texts
         assert (colours.corners[:6] == [255, 0, 0]).all()
         assert (colours.corners[6:] == [0, 0, 255]).all()
     mesh, texts = load(write("a.obj", "mtllib a.mtl\n" + body))
     assert "lack the material blue" in texts[0]
-    colours = surface_colours(
-        load(write("a.obj", f"mtllib a.mtl\n{POINTS}usemtl red\n{HALVES[0]}usemtl\n{HALVES[1]}"))[0]
-    )
+    colours = load(
+        write("a.obj", f"mtllib a.mtl\n{POINTS}usemtl red\n{HALVES[0]}usemtl\n{HALVES[1]}")
+    )[0].colours
     assert (colours.corners[6:] == 255).all(), "no name: no material"
 
 
@@ -119,7 +119,7 @@ def test_options_of_a_texture_precede_its_name(
     pixels = picture(folder / (file.lower() if name.isupper() else file))
     path = write(tmp_path, f"newmtl label\nKd 1 1 1\nmap_Kd {options} {name}\n")
     mesh, texts = load(path)
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     assert not texts
     np.testing.assert_array_equal(colours.textures[0], pixels)
     expected = np.array([[0, 0], [1, 0], [0, 1]]) * scale + offset
@@ -133,7 +133,7 @@ def test_a_library_in_another_encoding_finds_its_texture(tmp_path, load, encodin
     path = write(tmp_path, "")
     (tmp_path / "a.mtl").write_bytes(f"newmtl label\nmap_Kd {name}\n".encode(encoding))
     mesh, texts = load(path)
-    assert has_colours(mesh)
+    assert mesh.has_colours
     assert not texts
 
 
@@ -148,20 +148,20 @@ def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_i
     ):
         path = write(tmp_path / "models", f"newmtl label\nmap_Kd {name}\n")
         mesh, texts = load(path)
-        assert not has_colours(mesh)
+        assert not mesh.has_colours
         assert len(texts) == 1
         assert "label.png" in texts[0]
-        assert [warning.kind for warning in cr.mesh.mesh_warnings(mesh)] == ["texture"]
+        assert [warning.kind for warning in mesh.warnings] == ["texture"]
         mesh, texts = load(path, textures=tmp_path / "images")
-        assert has_colours(mesh)
+        assert mesh.has_colours
         assert not texts
     path = write(tmp_path / "models", "newmtl label\nmap_Kd ../images/label.png\n")
     assert "lies outside of its folder" in load(path)[1][0]
-    assert has_colours(load(path, textures=tmp_path)[0])
+    assert load(path, textures=tmp_path)[0].has_colours
     path.write_text(path.read_text().replace("mtllib a.mtl", "mtllib ../a.mtl"))
     (path.parent / "a.mtl").rename(tmp_path / "a.mtl")
     assert "../a.mtl lies outside of its folder" in load(path)[1][0]
-    assert has_colours(load(path, textures=tmp_path)[0])
+    assert load(path, textures=tmp_path)[0].has_colours
 
 
 def test_colours_behind_the_coordinates(write, load):
@@ -169,7 +169,7 @@ def test_colours_behind_the_coordinates(write, load):
         points = "".join(
             f"{line} {k % 2 * scale} 0 {scale}\n" for k, line in enumerate(POINTS.splitlines())
         )
-        colours = surface_colours(load(write("a.obj", points + "".join(HALVES)))[0])
+        colours = load(write("a.obj", points + "".join(HALVES)))[0].colours
         assert set(map(tuple, colours.corners.reshape(-1, 3).tolist())) == {
             (0, 0, 255),
             (255, 0, 255),
@@ -251,7 +251,7 @@ def test_a_can_of_two_materials_that_look_alike_is_grey(tmp_path, write, load):
     text = f"mtllib two.mtl\n{points}{UV}usemtl steel\n{''.join(rows)}"
     mesh, texts = load(write("can.obj", text), unit="mm")
     assert not texts
-    assert not has_colours(mesh)
+    assert not mesh.has_colours
     assert len(mesh_symmetries(mesh)) == 72
 
 
@@ -262,7 +262,7 @@ def test_options_of_the_command_line_reach_the_reader(tmp_path):
     add_options(parser, *MESH)
     arguments = parser.parse_args(["--textures", str(tmp_path / "images"), "--unit", "m"])
     mesh = register_options(arguments).load_mesh(path)
-    assert has_colours(mesh)
+    assert mesh.has_colours
     arguments = parser.parse_args(["--link", "tip"])
     with pytest.raises(MeshError, match="only a URDF has links"):
         register_options(arguments).load_mesh(path)

@@ -16,7 +16,7 @@ from curvireg_torch.errors import CurviregWarning
 from curvireg_torch.formats.meshes.colours import texture_pixels
 from curvireg_torch.formats.meshes.polygons import divide_faces, triangles_of_faces
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, colour_bytes
-from curvireg_torch.mesh import has_colours, surface_colours
+from curvireg_torch.mesh.colours import colours_of_parts
 from curvireg_torch.utils.extras import is_installed
 from tests.formats.meshes.test_cad import solid, threemf
 from tests.formats.meshes.test_gltf import Tree
@@ -35,13 +35,13 @@ QUARTER = [0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 
 def first_corners(mesh):
     """The colours of the first corner of each face."""
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     return colours.corners[:, 0].tolist()
 
 
 def textures(mesh):
     """The colour of each face's texture in its first texel; white where there is none."""
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     plain = [texture[0, 0].tolist() for texture in colours.textures]
     return [plain[k] if k >= 0 else WHITE for k in colours.texture]
 
@@ -125,7 +125,7 @@ def textured(more, material=None):
 
 
 def coordinates(mesh):
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     return colours.uv[0] * [1, -1] + [0, 1]  # from the top left, as in glTF
 
 
@@ -147,7 +147,7 @@ def test_specular_colours_win_over_metallic_ones(tmp_path):
     material = {"pbrMetallicRoughness": metallic, "extensions": specular}
     mesh = cr.load_mesh(textured({}, material).write(tmp_path / "a.gltf"))
     assert (first_corners(mesh), textures(mesh)) == ([BLUE], [WHITE])
-    assert surface_colours(mesh).textures == ()
+    assert mesh.colours.textures == ()
 
 
 def test_a_picture_as_webp_wins(tmp_path):
@@ -329,7 +329,7 @@ def test_helpers_and_holes_are_no_surface(tmp_path, load):
     holed = square("int[] holeIndices = [0]", counts="3, 3", indices="0, 1, 2, 0, 2, 3")
     path.write_text(stage(holed))
     mesh, _ = load(path)
-    assert mesh.triangles.tolist() == [[[0, 0, 0], [2, 1, 0], [0, 1, 0]]]
+    assert mesh.surface.triangles.tolist() == [[[0, 0, 0], [2, 1, 0], [0, 1, 0]]]
 
 
 @needs_usd
@@ -378,9 +378,8 @@ def test_faces_keep_their_side_and_convex_ones_are_fans(order, signs):
 
 
 def test_a_mirrored_part_keeps_its_outside_and_its_colours():
-    colours = surface_colours(
-        trimesh.Trimesh(TRIANGLE, [[0, 1, 2]], vertex_colors=[RED, GREEN, BLUE])
-    )
+    triangle = trimesh.Trimesh(TRIANGLE, [[0, 1, 2]], vertex_colors=[RED, GREEN, BLUE])
+    (colours,) = colours_of_parts([triangle])
     colours.uv[0] = [[0, 0], [1, 0], [0, 1]]
     mesh = ReadMesh(np.array(TRIANGLE), np.array([[0, 1, 2]]), colours, "mm", "y")
     for signs, corners in (((-1, 1, 1), [BLUE, GREEN, RED]), ((-1, -1, 1), [RED, GREEN, BLUE])):
@@ -431,7 +430,7 @@ def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(write,
         names = "".join(f"property float {name}\n" for name in ("red", "green", "blue"))
         text = header(names, "") + rows([*shades, "1 1 1"]) + "3 0 1 2\n3 3 0 1\n"
     mesh = cr.load_mesh(write(f"a.{suffix}", text))
-    assert has_colours(mesh)
+    assert mesh.has_colours
     assert first_corners(mesh) == [[255, 51, 0], WHITE]
 
 
@@ -486,7 +485,7 @@ def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path, load):
     threemf(tmp_path / "a.3mf", solid(1), unit='unit="millimeter"')
     shape = '<geometry><mesh filename="a.3mf"/></geometry>'
     mesh, _ = load(robot(tmp_path, shape))
-    assert mesh.units == "m"
+    assert mesh.unit == "m"
     np.testing.assert_allclose(mesh.extents, [0.03, 0.02, 0.01])
 
 
@@ -499,7 +498,7 @@ def test_colours_of_a_material_in_memory():
     ):
         mesh = trimesh.Trimesh(TRIANGLE, [[0, 1, 2]], process=False)
         mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((3, 2)), material=material)
-        colours = surface_colours(mesh)
+        (colours,) = colours_of_parts([mesh])
         found = None if colours is None else colours.corners[0, 0].tolist()
         assert found == expected
 

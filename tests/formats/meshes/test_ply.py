@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from curvireg_torch.mesh import has_colours, surface_colours
 from tests._support.doubling import check_linear
 
 POINTS = [(0, 0, 0), (4, 0, 0), (4, 2, 0), (0, 2, 0)]
@@ -33,7 +32,7 @@ def test_colours_under_every_name(write, load, prefix, short, kind, scale):
     vertex = "".join(f"property {kind} {name}\n" for name in names)
     extra = [" ".join(f"{shade * scale:g}" for shade in shades) for shades in SHADES]
     mesh, texts = load(write("a.ply", header(vertex, "") + rows(extra) + "3 0 1 2\n3 0 2 3\n"))
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     assert not texts
     np.testing.assert_array_equal(colours.corners, np.array(SHADES)[mesh.faces])
 
@@ -56,7 +55,7 @@ def test_two_textures_are_read_or_named(tmp_path, write, load):
         + faces.format(1, 0)
     )
     mesh, texts = load(write("a.ply", text))
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     assert not texts
     for k, number in enumerate(colours.texture):
         np.testing.assert_array_equal(colours.textures[number], pixels[1 - k])
@@ -64,7 +63,7 @@ def test_two_textures_are_read_or_named(tmp_path, write, load):
     text = header("", face, comments=comments) + rows([""] * 4) + faces.format("", "")
     mesh, texts = load(write("a.ply", text))
     assert "names 2 textures and does not say which face has which" in texts[0]
-    assert has_colours(mesh)
+    assert mesh.has_colours
     text = header("", "", comments=comments) + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n"
     assert "has no texture coordinates" in load(write("a.ply", text))[1][0]
 
@@ -75,7 +74,7 @@ def test_texture_coordinates_of_vertices(tmp_path, write, load, names):
     vertex = "".join(f"property float {name}\n" for name in names)
     text = header(vertex, "", count=1, comments="comment TextureFile 0.png\n")
     mesh, texts = load(write("a.ply", text + rows(["0 0", "1 0", "1 1", "0 1"]) + "4 0 1 2 3\n"))
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     assert not texts
     np.testing.assert_array_equal(colours.textures[0], pixels)
     np.testing.assert_allclose(
@@ -94,12 +93,13 @@ def test_concave_faces_keep_their_texture_coordinates(tmp_path, write, load):
             "a.ply", f"{text}{points}4 0 1 2 3 8 0 0 .1 .2 0 .1 .9 .2\n3 0 1 2 6 0 0 .1 .2 0 .1\n"
         )
     )
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     assert colours is not None
-    assert (len(mesh.faces), mesh.area) == (3, pytest.approx(1.5))
+    assert (len(mesh.faces), mesh.surface.area) == (3, pytest.approx(1.5))
     expected = np.array([[0, 0], [0.1, 0.2], [0, 0.1], [0.9, 0.2]])
     corner = [
-        [POINT.index(tuple(p)) for p in one] for one in mesh.triangles.round().astype(int).tolist()
+        [POINT.index(tuple(p)) for p in one]
+        for one in mesh.surface.triangles.round().astype(int).tolist()
     ]
     np.testing.assert_allclose(colours.uv, expected[corner], atol=1e-6)
 
@@ -120,7 +120,7 @@ def test_remarks_in_any_encoding(tmp_path, write, load, encoding):
         + "3 0 1 2\n3 0 2 3\n"
     )
     mesh, texts = load(write("a.ply", text.encode(encoding)))
-    assert has_colours(mesh)
+    assert mesh.has_colours
     assert not texts
 
 

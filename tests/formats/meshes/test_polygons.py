@@ -103,9 +103,9 @@ def test_load_mesh_leaves_the_gap_of_a_concave_face_open(tmp_path, kind):
     mesh = cr.load_mesh(path)
     fans = [[f[0], f[i], f[i + 1]] for f in faces for i in range(1, len(f) - 1)]
     assert silhouette(trimesh.Trimesh(vertices, fans, process=False)) - silhouette(mesh) > 150
-    assert (mesh.area, len(mesh.faces)) == (pytest.approx(2 * 7 + 16), 2 * 6 + 8 * 2)
+    assert (mesh.surface.area, len(mesh.faces)) == (pytest.approx(2 * 7 + 16), 2 * 6 + 8 * 2)
     if kind == "ply with colours":
-        assert (mesh.metadata["colours"].corners == [255, 0, 0]).all()
+        assert (mesh.colours.corners == [255, 0, 0]).all()
 
 
 def test_divided_faces_of_an_obj_keep_texture_coordinates_at_their_corners(tmp_path):
@@ -116,9 +116,9 @@ def test_divided_faces_of_an_obj_keep_texture_coordinates_at_their_corners(tmp_p
     (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd a.png\n")
     path.write_text("mtllib a.mtl\nusemtl skin\n" + path.read_text())
     mesh = cr.load_mesh(path)
-    uv = mesh.metadata["colours"].uv
+    uv = mesh.colours.uv
     np.testing.assert_allclose(uv, np.asarray(mesh.vertices)[mesh.faces][..., :2] / 4, atol=1e-6)
-    assert mesh.area == pytest.approx(30)
+    assert mesh.surface.area == pytest.approx(30)
 
 
 def binary_ply(faces, vertices):
@@ -134,7 +134,7 @@ def test_load_mesh_reads_binary_ply_of_one_number_of_corners(tmp_path):
     vertices, faces = prism()
     path = tmp_path / "u.ply"
     path.write_bytes(binary_ply(faces[:2], vertices))
-    assert cr.load_mesh(path).area == pytest.approx(2 * 7)
+    assert cr.load_mesh(path).surface.area == pytest.approx(2 * 7)
     # 12 corners as three quads
     path.write_bytes(binary_ply([[0, 1, 2, 3], [4, 5, 6], [7, 8, 9, 10, 11]], vertices))
     with pytest.raises(
@@ -164,7 +164,7 @@ def test_load_mesh_reads_every_face_of_an_obj(tmp_path, line, triangles):
     path = tmp_path / "box.obj"
     path.write_text(BOX + "\n".join(rows) + "\n")
     mesh = cr.load_mesh(path)
-    assert (len(mesh.faces), abs(mesh.volume)) == (12, pytest.approx(1.0))
+    assert (len(mesh.faces), abs(mesh.surface.volume)) == (12, pytest.approx(1.0))
 
 
 @pytest.mark.parametrize("face", ["f 0 1 2", "f 1 2 0", "f 3/1/1 0/1/1 1/1/1", "f 0 1 2 3"])

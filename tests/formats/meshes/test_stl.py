@@ -31,7 +31,7 @@ def ascii_stl(name="part", point="  vertex {:.4f} {:.4f} {:.4f}\n"):
 
 def check(mesh):
     assert (len(mesh.faces), mesh.extents.round(6).tolist()) == (12, [3.0, 2.0, 1.0])
-    assert mesh.volume == pytest.approx(6.0, rel=1e-6)
+    assert mesh.surface.volume == pytest.approx(6.0, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.formats.meshes import colours, source
-from curvireg_torch.mesh import has_colours, mesh_warnings, surface_colours
+from curvireg_torch.mesh import as_mesh
 from tests.formats.meshes.test_hostile_meshes import tree
 from tests.formats.meshes.test_obj import write as write_obj
 
@@ -76,10 +76,8 @@ def test_only_the_formats_of_photographs_are_decoded(tmp_path, load, monkeypatch
 
     monkeypatch.setattr("subprocess.Popen", refuse)
     mesh, texts = load(write(tmp_path, carrier, encoded(kind)))
-    assert has_colours(mesh) == FORMATS[kind]
-    assert [warning.kind for warning in mesh_warnings(mesh)] == (
-        [] if FORMATS[kind] else ["texture"]
-    )
+    assert mesh.has_colours == FORMATS[kind]
+    assert [warning.kind for warning in mesh.warnings] == ([] if FORMATS[kind] else ["texture"])
     assert all("not an image that is read" in text for text in texts)
 
 
@@ -89,7 +87,7 @@ def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path):
     with Image.open(tmp_path / "a.eps") as picture:
         mesh.visual = trimesh.visual.TextureVisuals(uv=mesh.vertices[:, :2], image=picture)
         with pytest.warns(UserWarning, match="the format EPS is not read"):
-            assert surface_colours(mesh) is None or not has_colours(mesh)
+            assert as_mesh(mesh).colours is None
 
 
 def test_pixels_of_all_textures_together_are_bounded(tmp_path, load, monkeypatch):
@@ -106,7 +104,7 @@ def test_pixels_of_all_textures_together_are_bounded(tmp_path, load, monkeypatch
     monkeypatch.setattr(source, "MAX_TEXTURE_PIXELS", 3999)
     monkeypatch.setattr(colours, "MAX_TEXTURE_PIXELS", 3999)
     mesh, texts = load(path)
-    found = surface_colours(mesh)
+    found = mesh.colours
     assert len(found.textures) == 3
     assert len(texts) == 1
     assert (
@@ -149,11 +147,9 @@ def test_large_textures_are_reduced_in_every_mode(mode):
 
 def test_a_mesh_without_any_colour_has_none(write):
     assert (
-        surface_colours(
-            cr.load_mesh(
-                write("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n")
-            )
-        )
+        cr.load_mesh(
+            write("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n")
+        ).colours
         is None
     )
 

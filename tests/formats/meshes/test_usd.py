@@ -11,7 +11,6 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError, MissingDependencyError
 from curvireg_torch.formats.meshes import usd
 from curvireg_torch.formats.meshes.files import mesh_files
-from curvireg_torch.mesh import has_colours, mesh_up, surface_colours
 from curvireg_torch.mesh.colours import colours_at
 from curvireg_torch.utils import extras
 from curvireg_torch.utils.extras import is_installed
@@ -96,12 +95,12 @@ def test_places_units_axes_and_polygons(tmp_path, load):
     place += '    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]\n'
     path.write_text(stage(square(), place=place))
     mesh, texts = load(path)
-    assert (mesh.units, mesh_up(mesh), texts) == ("mm", "z", [])
+    assert (mesh.unit, mesh.up, texts) == ("mm", "z", [])
     np.testing.assert_allclose(mesh.bounds, [[10, 0, 5], [12, 0, 6]], atol=1e-6)
-    np.testing.assert_allclose(mesh.face_normals, [[0, -1, 0]] * 2, atol=1e-6)
-    assert not has_colours(mesh)
+    np.testing.assert_allclose(mesh.surface.face_normals, [[0, -1, 0]] * 2, atol=1e-6)
+    assert not mesh.has_colours
     path.write_text(stage(square('uniform token orientation = "leftHanded"'), place=place))
-    np.testing.assert_allclose(load(path)[0].face_normals, [[0, 1, 0]] * 2, atol=1e-6)
+    np.testing.assert_allclose(load(path)[0].surface.face_normals, [[0, 1, 0]] * 2, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -116,10 +115,10 @@ def test_units_and_axes_are_those_of_the_stage(tmp_path, load, about, unit, up, 
     path = tmp_path / "part.usda"
     path.write_text(stage(square(), about=about))
     mesh, _ = load(path)
-    assert (mesh.units, mesh_up(mesh)) == (unit, up)
+    assert (mesh.unit, mesh.up) == (unit, up)
     assert mesh.extents[0] == pytest.approx(width)
     if "metersPerUnit" not in about:
-        assert load(path, unit="mm")[0].units == "mm"
+        assert load(path, unit="mm")[0].unit == "mm"
 
 
 def test_colours_of_the_mesh(tmp_path, load):
@@ -128,9 +127,9 @@ def test_colours_of_the_mesh(tmp_path, load):
     path = tmp_path / "part.usda"
     path.write_text(stage(square(more, counts="3, 3", indices="0, 1, 2, 0, 2, 3")))
     mesh, _ = load(path)
-    found = surface_colours(mesh)
+    found = mesh.colours
     assert found.corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
-    assert has_colours(mesh)
+    assert mesh.has_colours
 
 
 @pytest.mark.parametrize("kind", ["usda", "usdz"])
@@ -146,7 +145,7 @@ def test_textures_by_the_coordinates_that_they_name(tmp_path, load, kind):
         package(path, text, textures__print_png=png())
     mesh, texts = load(path)
     assert not texts
-    found = surface_colours(mesh)
+    found = mesh.colours
     assert found is not None
     near = np.array([0.8, 0.1], np.float32)
     lower = colours_at(
@@ -165,7 +164,7 @@ def painted(colour):
 
 
 def textures_of(mesh):
-    colours = surface_colours(mesh)
+    colours = mesh.colours
     return [texture[0, 0].tolist() for texture in colours.textures]
 
 
@@ -217,7 +216,7 @@ def test_textures_are_scaled(tmp_path, load):
         path.write_text(stage(scaled, square(MAP, BOUND)))
         mesh, texts = load(path)
         assert len(texts) == count
-        colours = surface_colours(mesh)
+        colours = mesh.colours
         assert colours.corners[0, 0].tolist() == tint
 
 
