@@ -89,6 +89,7 @@ class Inspection:
         """One sentence: what the mesh is, what looks alike, and what would help.
 
         Example:
+            >>> import trimesh
             >>> Inspection(mesh_facts(trimesh.creation.icosphere(3))).in_brief
             'grey mesh: a sphere: it looks the same from everywhere, so its rotation cannot be seen'
         """
@@ -191,6 +192,7 @@ def inspect(
         InvalidInputError: a mesh that cannot be read, or a number below 0.
 
     Example:
+        >>> import trimesh
         >>> report = inspect(trimesh.creation.box((1, 2, 3)), n=0)
         >>> report.facts.is_watertight, len(report.facts.symmetries)
         (True, 3)

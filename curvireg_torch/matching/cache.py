@@ -107,7 +107,7 @@ def cached_bank(
         folder: default :func:`cache_folder`.
 
     Example:
-        >>> import tempfile
+        >>> import tempfile, trimesh
         >>> folder = Path(tempfile.mkdtemp())
         >>> bank = cached_bank(trimesh.creation.box(), Pipeline().views.sphere()[:2],
         ...     folder=folder, progress=False)

@@ -36,6 +36,7 @@ def render_colour(
         (N, 3, H, W) float32 RGB in [0, 1] on the CPU.
 
     Example:
+        >>> import trimesh
         >>> box = trimesh.creation.box()
         >>> box.visual.face_colors = [200, 20, 20, 255]
         >>> K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]])

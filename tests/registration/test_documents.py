@@ -13,7 +13,7 @@ from tests._support.results import registration
 
 
 class Bank(list):
-    mesh = SimpleNamespace(units="mm")
+    mesh = SimpleNamespace(unit="mm")
 
 
 REGISTRAR = SimpleNamespace(
