@@ -21,7 +21,7 @@ from ..utils.choices import UNITS
 from ..utils.files import file_digest, text_digest
 from ..utils.likes import BoxLike
 from .options import RegisterOptions, prior_from_limits
-from .views import View
+from .views import RigView
 
 # standard deviation of the focal length of a given field of view, as a fraction of it
 VIEW_DEVIATION = 0.1
@@ -44,7 +44,7 @@ class Entry:
     prior: PosePrior | None = None
     start: PoseFile | None = None  # the pose that is refined; nothing is searched for
     # other photographs, found together with this one, whose camera is their world
-    views: tuple[View, ...] = ()
+    views: tuple[RigView, ...] = ()
     # boxes refer to the pixels in the file; else the EXIF orientation is applied first
     as_stored: bool = False
     label: str = ""  # of a dataset's object: a name that no other object has

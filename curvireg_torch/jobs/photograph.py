@@ -34,7 +34,7 @@ from .entry import Entry, Observation, observe, start_in_unit
 from .opening import load_bank
 from .outputs import output_folder
 from .result_files import write_result
-from .views import View, register_views
+from .views import RigView, register_views
 
 __all__ = ["RegisteredPhotograph", "register"]
 
@@ -236,7 +236,7 @@ def _results_of(observation: Observation, registrar: Registrar) -> Results:
         assert camera is not None  # of datasets with cameras only
         world = torch.eye(4, dtype=torch.float64)
         pixels = observation.photo.image
-        first = View(entry.name, entry.photo, entry.box, camera, world, pixels)
+        first = RigView(entry.name, entry.photo, entry.box, camera, world, pixels)
         together, _ = register_views([first, *entry.views], registrar, as_stored=entry.as_stored)
         best, *others = together.hypotheses
         best = replace(

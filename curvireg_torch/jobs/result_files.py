@@ -15,7 +15,7 @@ from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
 from .documents import SCHEMA
 from .store import to_json
-from .views import View
+from .views import RigView
 
 # of the largest mesh that is written: viewers are slow with files above 30 MB
 MAX_GLB_FACES = 300_000
@@ -55,7 +55,7 @@ def write_views(
     document: dict[str, Any],
     registrar: Registrar,
     result: Registration,
-    views: Sequence[View],
+    views: Sequence[RigView],
 ) -> None:
     """Write the files of one pose in several photographs."""
     faces = len(registrar.of_mesh(result.mesh_index).bank.mesh.faces)
@@ -63,7 +63,7 @@ def write_views(
     _write(out, document, faces, lambda: views_picture(*arguments), lambda: views_glb(*arguments))
 
 
-def views_picture(registrar: Registrar, result: Registration, views: Sequence[View]) -> bytes:
+def views_picture(registrar: Registrar, result: Registration, views: Sequence[RigView]) -> bytes:
     """``overlay.png`` of several photographs: those that could be read, with the contours at the
     pose."""
     shown = []
@@ -76,7 +76,7 @@ def views_picture(registrar: Registrar, result: Registration, views: Sequence[Vi
     return png(views_sheet(registrar.of_mesh(result.mesh_index).describer, shown))
 
 
-def views_glb(registrar: Registrar, result: Registration, views: Sequence[View]) -> bytes:
+def views_glb(registrar: Registrar, result: Registration, views: Sequence[RigView]) -> bytes:
     """``pose.glb`` of several photographs, with the cameras of those that count."""
     assert result.transform is not None
     cameras = []

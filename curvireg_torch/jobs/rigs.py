@@ -23,7 +23,7 @@ from ..utils.checks import check_pose
 from ..utils.files import FindFile, check_table_size, finite_numbers, found_in, read_csv, read_json
 from .documents import result_document
 from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, numbers_of
-from .views import View, register_views
+from .views import RigView, register_views
 
 ROTATION = POSE_COLUMNS[:9]
 TRANSLATION = POSE_COLUMNS[9:]
@@ -35,7 +35,9 @@ COLUMNS = (
 )
 
 
-def read_rig(path: Path, mesh: Path | None = None, *, find: FindFile | None = None) -> list[View]:
+def read_rig(
+    path: Path, mesh: Path | None = None, *, find: FindFile | None = None
+) -> list[RigView]:
     """Read a rig: a CSV file, a folder of COLMAP with ``images.txt`` and ``cameras.txt``, or a
     scene of a BOP set.
 
@@ -60,7 +62,7 @@ def read_rig(path: Path, mesh: Path | None = None, *, find: FindFile | None = No
     return _checked(path, _table(read_csv(path), find))
 
 
-def _checked(path: Path, rows: Iterator[View]) -> list[View]:
+def _checked(path: Path, rows: Iterator[RigView]) -> list[RigView]:
     """The rows, whose errors name the file."""
     try:
         views = list(islice(rows, MAX_RIG_VIEWS + 1))
@@ -77,7 +79,7 @@ def _checked(path: Path, rows: Iterator[View]) -> list[View]:
 
 def _view(
     name: str, photo: Path, box: Any, camera: Camera | None, rotation: Any, translation: Any
-) -> View:
+) -> RigView:
     """A row; ``rotation`` are 9 numbers, or 4 of a quaternion."""
     try:
         numbers = finite_numbers(rotation, 9) or finite_numbers(rotation, 4)
@@ -100,12 +102,12 @@ def _view(
         )
         T = transform(R, torch.tensor(t, dtype=torch.float64))
         check_pose(T, "the camera's pose")
-        return View(name, photo, box, camera, T)
+        return RigView(name, photo, box, camera, T)
     except CurviregError as error:
         raise InvalidInputError(str(error), subject=name) from error
 
 
-def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[View]:
+def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[RigView]:
     header, *rows = cells or [[]]
     names = [name.strip().lower() for name in header]
     if twice := sorted({name for name in names if name and names.count(name) > 1}):
@@ -139,7 +141,7 @@ def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[View]:
         yield _view(name, find(row["photo"]), box, camera, rotation, translation)
 
 
-def _colmap(folder: Path, find: FindFile) -> Iterator[View]:
+def _colmap(folder: Path, find: FindFile) -> Iterator[RigView]:
     """Photographs of ``images.txt`` that lie in the folder, in ``images`` in it, or beside it."""
     check_table_size(folder / "images.txt")
     try:
@@ -189,7 +191,7 @@ def _are_points(line: str) -> bool:
     )
 
 
-def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[View]:
+def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[RigView]:
     """Photographs of a scene whose cameras have ``cam_R_w2c`` and ``cam_t_w2c``; lengths in mm."""
     cameras, truths, infos = (
         read_json(folder / name, dict, "datasets/bop/README.md")
@@ -234,8 +236,8 @@ def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[View]:
 
 
 def register_rig(
-    path: Path, rig: Sequence[View], registrar: Registrar, *, bank_seconds: float
-) -> tuple[Registration, dict[str, Any], list[View]]:
+    path: Path, rig: Sequence[RigView], registrar: Registrar, *, bank_seconds: float
+) -> tuple[Registration, dict[str, Any], list[RigView]]:
     """Register the photographs of a rig together, see :func:`.photograph.register_views`.
 
     Returns the registration, its document, and the photographs as they were read.

@@ -16,7 +16,7 @@ from ..utils.likes import BoxLike
 
 
 @dataclass(frozen=True)
-class View:
+class RigView:
     """One of several photographs of an object in one pose."""
 
     name: str  # as the user calls the photograph
@@ -28,8 +28,8 @@ class View:
 
 
 def register_views(
-    views: Sequence[View], registrar: Registrar, *, as_stored: bool = False
-) -> tuple[Registration, list[View]]:
+    views: Sequence[RigView], registrar: Registrar, *, as_stored: bool = False
+) -> tuple[Registration, list[RigView]]:
     """Register several photographs together, see :meth:`.Registrar.register_views`, without their
     distortion.
 

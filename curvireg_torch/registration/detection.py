@@ -164,7 +164,7 @@ def _allowed_views(target: Target, item: Photograph) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class DescribedBox:
     """A described box (4,) of a photograph, with its ``response`` and ``rival``
     (:func:`detection_probability`), and as ``score`` the probability that it shows the object."""
 
@@ -182,7 +182,7 @@ class Candidate:
         box: Tensor,
         response: float,
         rival: float | None,
-    ) -> "Candidate":
+    ) -> "DescribedBox":
         """Compare a box (4,) with all views."""
         query = target.matcher.query([item.image], box[None].float())
         allowed = None
@@ -192,15 +192,15 @@ class Candidate:
         score = detection_probability(response, similarity, rival=rival)
         return cls(box, response, rival, query, score)
 
-    def register(self, target: Target, item: Photograph) -> "Found":
+    def register(self, target: Target, item: Photograph) -> "RegisteredBox":
         (result,) = register(target, [replace(item, box=self.box.float())], self.query)
         box = projected_box(target.describer, result.projection)
-        return Found(**{**vars(self), "box": box}, registration=result)
+        return RegisteredBox(**{**vars(self), "box": box}, registration=result)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found(Candidate):
-    """A registered candidate, with the ``box`` (4,) around its pose."""
+class RegisteredBox(DescribedBox):
+    """One that was registered; its ``box`` (4,) is that around the pose."""
 
     registration: Registration
 
@@ -214,7 +214,7 @@ class Found(Candidate):
 
 def _register_candidates(
     target: Target, item: Photograph, proposals: Proposals, instances: int
-) -> list[Found]:
+) -> list[RegisteredBox]:
     """The most probable objects, at most ``instances``, whose boxes do not overlap; the error of
     the best if there is none."""
     candidates = []
@@ -225,31 +225,31 @@ def _register_candidates(
     ):
         rival = max([0.0, *counts[:k], *counts[k + 1 :]]) if k < len(counts) else None
         try:
-            candidates.append(Candidate.compared(target, item, box, response, rival))
+            candidates.append(DescribedBox.compared(target, item, box, response, rival))
         except CurviregError as error:  # such as limits on the pose that leave no view here
             failed = failed or error
     if not candidates and failed is not None:
         raise failed
     boxes = torch.stack([c.box for c in candidates])
     scores = torch.tensor([c.score for c in candidates])
-    found: list[Found] = []
+    found: list[RegisteredBox] = []
     for k in non_maximum_suppression(boxes, scores, SAME_OBJECT_OVERLAP).tolist():
         if len(found) < max(instances, MIN_REGISTERED):
             _add(found, _refined(target, item, candidates[k].register(target, item)))
     return sorted(found, key=lambda one: one.probability, reverse=True)[:instances]
 
 
-def _refined(target: Target, item: Photograph, found: Found) -> Found:
+def _refined(target: Target, item: Photograph, found: RegisteredBox) -> RegisteredBox:
     """The more certain one of a registration and of that of the box around its pose."""
     try:
-        candidate = Candidate.compared(target, item, found.box, found.response, found.rival)
+        candidate = DescribedBox.compared(target, item, found.box, found.response, found.rival)
     # the projected mesh lies outside the photograph: nothing there supports the pose
     except InvalidInputError:
         return replace(found, score=0.0)
     return found if candidate.score <= found.score else candidate.register(target, item)
 
 
-def _add(found: list[Found], new: Found) -> None:
+def _add(found: list[RegisteredBox], new: RegisteredBox) -> None:
     """Add ``new``. Of those whose boxes overlap the most certain is kept: proposals may lead to the
     same object."""
     overlap = box_iou(new.box[None], torch.stack([new.box, *(one.box for one in found)]))[
@@ -261,7 +261,7 @@ def _add(found: list[Found], new: Found) -> None:
         found.append(new)
 
 
-def _with_proposals(found: list[Found], proposals: Proposals) -> list[Registration]:
+def _with_proposals(found: list[RegisteredBox], proposals: Proposals) -> list[Registration]:
     """Registrations with all proposals, their own boxes first, and the score as a factor of their
     probabilities."""
     boxes = torch.cat([torch.stack([one.box for one in found]), proposals.boxes.double()])

@@ -170,11 +170,11 @@ class RigPhotograph(Described):
 
 
 # Photographs of a rig by their index, or why they failed
-Found = dict[int, RigPhotograph | CurviregError]
+RigPhotographs = dict[int, RigPhotograph | CurviregError]
 
 
 @dataclass(frozen=True)
-class Answer:
+class JointPoses:
     """M candidate poses in the world, best first, with evidence and scores, each (V, M), in V
     photographs, and covariances (M, 6, 6), NaN where unfinished."""
 
@@ -201,7 +201,7 @@ class Rig:
         self.eyes = -(self.cameras[:, :3, :3].mT @ self.cameras[:, :3, 3:])[..., 0]
 
     @staticmethod
-    def of(target: Target, found: Found) -> "Rig":
+    def of(target: Target, found: RigPhotographs) -> "Rig":
         """The photographs that were registered, if there are any, in the unit of the mesh."""
         usable = [one for _, one in sorted(found.items()) if isinstance(one, RigPhotograph)]
         if not usable:
@@ -375,7 +375,7 @@ class Rig:
         support = torch.where(better, after, before).view(len(T), V).T
         return torch.linalg.inv(self.cameras[0]) @ state.T[::V], support, state
 
-    def answer(self) -> Answer:
+    def answer(self) -> JointPoses:
         """Candidates, fitted in all photographs and ordered by the sum of their scores; the
         hypotheses of one."""
         if len(self.photographs) == 1:
@@ -398,9 +398,9 @@ class Rig:
         scores = evidence.scores(self.score_weights)
         scores = _bounded(torch.where(sees, scores, -torch.inf))
         order = (self.weights(T[0]) @ scores).argsort(descending=True, stable=True)
-        return Answer(T[order], evidence[:, order], scores[:, order], covariance[order])
+        return JointPoses(T[order], evidence[:, order], scores[:, order], covariance[order])
 
-    def hypotheses_of_one(self) -> Answer:
+    def hypotheses_of_one(self) -> JointPoses:
         (photograph,) = self.photographs
         found = photograph.result.hypotheses
         evidence = Evidence.of_hypotheses([h.evidence for h in found])[None]
@@ -408,7 +408,7 @@ class Rig:
         unknown = torch.full((6, 6), torch.nan).double()
         C = torch.stack([unknown if h.covariance is None else h.covariance for h in found])
         scores = evidence.scores(self.score_weights)
-        return Answer(photograph.poses, evidence, scores, P.mT @ C @ P)
+        return JointPoses(photograph.poses, evidence, scores, P.mT @ C @ P)
 
     def covariances(self, T: Tensor, state: ContourState) -> Tensor:
         """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that
@@ -471,7 +471,7 @@ class Rig:
         )
         return scores[:, 0]
 
-    def lost(self, answer: Answer) -> dict[int, str]:
+    def lost(self, answer: JointPoses) -> dict[int, str]:
         """Why photographs do not show the best pose, by their index; {} if none shows it."""
         reasons: dict[int, str] = {}
         best = answer.evidence[:, 0]
@@ -493,7 +493,7 @@ class Rig:
                 )
         return reasons if len(reasons) < len(self.photographs) else {}
 
-    def hypothesis(self, answer: Answer, m: int, mean: Evidence) -> Hypothesis:
+    def hypothesis(self, answer: JointPoses, m: int, mean: Evidence) -> Hypothesis:
         """World pose ``m`` as it is reported, with ``mean`` evidence of the photographs."""
         first = self.photographs[0]
         T = answer.T[m]

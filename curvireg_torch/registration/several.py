@@ -30,7 +30,7 @@ from .photograph import (
     rig_cameras,
 )
 from .result import FailedRegistration, PhotographPose, Registration
-from .rig import ELSEWHERE, Answer, Found, Rig, RigPhotograph
+from .rig import ELSEWHERE, JointPoses, Rig, RigPhotograph, RigPhotographs
 from .stages import register_photographs
 from .target import Target
 
@@ -96,7 +96,7 @@ def register_views(
         if boxes is None
         else [i for i, box in enumerate(boxes) if not is_missing(box) and i not in copies]
     )
-    found: Found = {}
+    found: RigPhotographs = {}
     if given:
         found = _registered(target, items, cameras, given)
     else:
@@ -127,13 +127,13 @@ def _registered(
     cameras: Tensor,
     chosen: Sequence[int],
     T: Tensor | None = None,
-) -> Found:
+) -> RigPhotographs:
     """Some photographs registered alone: in their boxes, or in those around a world pose ``T`` (1,
     4, 4)."""
 
     placed = [_placed(target, items[i], cameras[i], T) for i in chosen]
     results = register_photographs(target, placed)
-    found: Found = {}
+    found: RigPhotographs = {}
     for i, item, result in zip(chosen, placed, results, strict=True):
         if isinstance(item, CurviregError):
             found[i] = item
@@ -157,7 +157,9 @@ def _placed(
     return replace(item, box=box[0].float()) if bool(visible) else LostObjectError(ELSEWHERE)
 
 
-def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> Registration:
+def _registration(
+    target: Target, found: RigPhotographs, cameras: Tensor, count: int
+) -> Registration:
     """The joint result of photographs, without those that failed or do not show the best pose;
     ``count`` hypotheses."""
     reasons = {i: one.message for i, one in found.items() if isinstance(one, CurviregError)}
@@ -212,7 +214,7 @@ def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> 
 
 
 def _joint_probabilities(
-    rig: Rig, every: Rig, answer: Answer, total: Tensor, features: Mapping[str, float | None]
+    rig: Rig, every: Rig, answer: JointPoses, total: Tensor, features: Mapping[str, float | None]
 ) -> tuple[float, ...]:
     """Probabilities of the poses with the sums ``total`` (M,) of scores in a ``rig``, which has
     ``every`` photograph but those that do not show the best pose: where these are confident of
@@ -233,14 +235,14 @@ def _joint_probabilities(
     return tuple(factor * probability for probability in probabilities)
 
 
-def _evidence_of_best(rig: Rig, answer: Answer) -> dict[int, dict[str, float]]:
+def _evidence_of_best(rig: Rig, answer: JointPoses) -> dict[int, dict[str, float]]:
     """What speaks for the best pose in each photograph, by the photograph's index."""
     best = answer.evidence[:, 0]
     return {photograph.index: best.named(v) for v, photograph in enumerate(rig.photographs)}
 
 
 def _joint_features(
-    rig: Rig, mean: Evidence, total: Tensor, weights: Tensor, answer: Answer
+    rig: Rig, mean: Evidence, total: Tensor, weights: Tensor, answer: JointPoses
 ) -> dict[str, float | None]:
     """:func:`.confidence_features` of the joint pose: ``mean`` evidence of M poses, ``total`` (M,)
     scores."""

@@ -30,7 +30,7 @@ from ..jobs.opening import open_registrar
 from ..jobs.options import QUALIFIERS, WITHIN, RegisterOptions, check_camera
 from ..jobs.photograph import register_observation
 from ..jobs.rigs import read_rig, register_rig
-from ..jobs.views import View
+from ..jobs.views import RigView
 from ..matching import ViewBank
 from ..mesh import Mesh, mesh_centre, mesh_radius
 from ..registration import Registrar, Registration
@@ -40,7 +40,7 @@ from .programs import command_line, python_program
 from .shot import Answer, Numbers, Result, Shot, numbers
 
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
-Found = tuple[Registration, dict[str, Any], Sequence[View]]
+Registered = tuple[Registration, dict[str, Any], Sequence[RigView]]
 UNPACKED = "parts"  # the folder of what was in an archive
 
 
@@ -67,7 +67,7 @@ class Session:
     shot: Shot = field(default_factory=Shot)
     removed: tuple[int, Shot] | None = None
     rig_path: Path | None = None
-    rig: tuple[View, ...] = ()
+    rig: tuple[RigView, ...] = ()
     searched: tuple[Shot, ...] = ()
     mesh_path: Path | None = None
     mesh: Mesh | None = None
@@ -154,7 +154,7 @@ class Session:
             self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
 
     def _opened(
-        self, path: Path, box: Numbers | None, view: View | None, camera: Numbers | Camera | None
+        self, path: Path, box: Numbers | None, view: RigView | None, camera: Numbers | Camera | None
     ) -> Shot:
         """A photograph and a box, those of a ``view`` of a rig if there is one, without the
         distortion of the camera, which must fit the photograph."""
@@ -175,7 +175,9 @@ class Session:
         notes = (*photo.notes, *["undistorted"] * camera.distorts)
         return Shot(path, replace(photo, image=image, notes=notes), box, view)
 
-    def _open_again(self, shot: Shot, view: View | None, camera: Numbers | Camera | None) -> Shot:
+    def _open_again(
+        self, shot: Shot, view: RigView | None, camera: Numbers | Camera | None
+    ) -> Shot:
         """A photograph with another camera, or row of a rig. Its box stays unless distortion is
         removed, or no longer is; its result only where no rig is concerned."""
         opened = self._opened(shot.path, None, view, camera)
@@ -213,13 +215,13 @@ class Session:
                 raise MissingFileError("no such file; drop it here", subject=subject) from error
             raise error.with_subject(subject) from error
 
-    def _read_rig(self, path: Path) -> tuple[View, ...]:
+    def _read_rig(self, path: Path) -> tuple[RigView, ...]:
         """The rows of a rig. It comes from anyone who has the address: it names files beside it
         only."""
         rig = tuple(
             read_rig(path, self.mesh_path, find=only_in(path if path.is_dir() else path.parent))
         )
-        rows = dict[str, View]()
+        rows = dict[str, RigView]()
         for view in rig:
             same = rows.setdefault(_key(view.photo), view)
             if same is not view:
@@ -241,7 +243,7 @@ class Session:
             )
         self._replace_shots(shots)
 
-    def _row_of(self, path: Path, shots: Sequence[Shot]) -> View | None:
+    def _row_of(self, path: Path, shots: Sequence[Shot]) -> RigView | None:
         """The row of the rig with the file name of a photograph, if none of ``shots`` has it."""
         taken = [_key(shot.path) for shot in shots if shot.view is not None]
         rows = [
@@ -455,7 +457,7 @@ class Session:
 
     def _register_alone(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
-    ) -> tuple[Found, list[Tensor | None]]:
+    ) -> tuple[Registered, list[Tensor | None]]:
         ((shot,), camera) = shots, self.options.camera
         assert shot.photo is not None
         entry = entry_of(request.photos[0], request)
@@ -470,7 +472,7 @@ class Session:
 
     def _register_rig(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
-    ) -> tuple[Found, list[Tensor | None]]:
+    ) -> tuple[Registered, list[Tensor | None]]:
         views = []
         for shot in shots:
             assert shot.view is not None

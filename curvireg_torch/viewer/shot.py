@@ -16,7 +16,7 @@ from ..geometry import rotation_error, rotation_from_axis_angle
 from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..jobs.options import RegisterOptions
 from ..jobs.result_files import views_glb, views_picture
-from ..jobs.views import View
+from ..jobs.views import RigView
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..utils.likes import BoxLike
 from ..visualization import contour_overlay, pose_glb
@@ -50,7 +50,7 @@ class Result:
     registrar: Registrar
     registration: Registration
     document: dict[str, Any]  # the content of result.json, if the first answer is chosen
-    photographs: Sequence[View]  # of a rig
+    photographs: Sequence[RigView]  # of a rig
     inputs: tuple[RegisterOptions, tuple[Numbers | None, ...]]  # what was asked for, in which boxes
     answer: Answer
     answer_before: Answer | None = None
@@ -144,7 +144,7 @@ class Shot:
     path: Path = Path()
     photo: Photo | None = None
     box: Numbers | None = None
-    view: View | None = None
+    view: RigView | None = None
     box_before: Numbers | None = None
     result: Result | None = None
     found_box: Tensor | None = None

@@ -14,7 +14,7 @@ from curvireg_torch.errors import InvalidInputError, MeshError, WorkerError
 from curvireg_torch.jobs import runner
 from curvireg_torch.jobs.entry import Entry
 from curvireg_torch.jobs.runner import run_entries
-from curvireg_torch.jobs.views import View
+from curvireg_torch.jobs.views import RigView
 from curvireg_torch.utils import sources
 from curvireg_torch.utils.executors import Workers
 from curvireg_torch.utils.files import write_file
@@ -214,7 +214,7 @@ def test_the_first_of_a_block_pays_for_the_bank(monkeypatch):
 
 def test_a_missing_photograph_beside_others_is_tried_again(entries, tmp_path):
     """Of several photographs of one pose."""
-    gone = View("gone.png", tmp_path / "gone.png", None, CAMERA, torch.eye(4))
+    gone = RigView("gone.png", tmp_path / "gone.png", None, CAMERA, torch.eye(4))
     rig = [replace(entries[0], views=(gone,)), replace(entries[2], views=(gone,))]
     assert registered(rig, tmp_path / "out") == ["0a", "1a"]
     assert registered(rig, tmp_path / "out") == ["0a", "1a"]
@@ -227,7 +227,7 @@ CAMERA = Camera(torch.eye(3))
 ENTRY = Entry(
     {"note": "x"}, "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=CAMERA
 )
-VIEWS = (View("z.png", Path("z.png"), None, CAMERA, torch.eye(4)),)
+VIEWS = (RigView("z.png", Path("z.png"), None, CAMERA, torch.eye(4)),)
 OTHERS = {
     "name": "y.png",
     "instances": 2,

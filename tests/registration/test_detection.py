@@ -22,7 +22,7 @@ from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.matching.detector import _medoids
 from curvireg_torch.registration import Detector, Proposals, detect
 from curvireg_torch.registration import detection as detection_module
-from curvireg_torch.registration.detection import Candidate, Found, _add, _allowed_views
+from curvireg_torch.registration.detection import DescribedBox, RegisteredBox, _add, _allowed_views
 from curvireg_torch.registration.photograph import Photograph
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from curvireg_torch.visualization.words import corners
@@ -180,7 +180,7 @@ def test_the_most_certain_of_all_proposals_is_reported(registrar, found, monkeyp
 def as_found(result, **changes):
     where = result.detection
     known = where.box, where.response, None, None, where.score
-    return replace(Found(*known, registration=result), **changes)
+    return replace(RegisteredBox(*known, registration=result), **changes)
 
 
 def test_probabilities_are_those_of_a_right_box_times_its_score(found):
@@ -368,7 +368,7 @@ def test_medoids_are_the_centres_of_clusters():
 def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_each(score, kept):
     def at(x0, score):
         box = torch.tensor([x0, 0.0, x0 + 10.0, 10.0])
-        return Found(box, 1.0, None, None, score, registration=None)
+        return RegisteredBox(box, 1.0, None, None, score, registration=None)
 
     found = [at(0.0, 0.9), at(5.0, 0.3)]
     _add(found, at(2.0, score))
@@ -384,7 +384,7 @@ def test_box_around_the_pose_is_registered_where_it_is_more_certain(
     one = as_found(found[2])
     other = as_found(found[2])
     again = SimpleNamespace(score=one.score + gain, register=lambda *_: other)
-    monkeypatch.setattr(Candidate, "compared", lambda *_, **__: again)
+    monkeypatch.setattr(DescribedBox, "compared", lambda *_, **__: again)
     best = detection_module._refined(registrar, Photograph(found[0], found[1], None), one)
     assert best is (one if kept else other)
 

@@ -11,7 +11,7 @@ from curvireg_torch.evidence import Evidence
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.registration import several
 from curvireg_torch.registration.confidence import hypothesis_probabilities
-from curvireg_torch.registration.rig import Answer
+from curvireg_torch.registration.rig import JointPoses
 
 ANY_RIGHT = 0.8
 EYE = torch.eye(4, dtype=torch.float64)
@@ -70,7 +70,7 @@ class FakeRig:
         values = Evidence(*[nothing] * len(fields(Evidence)))
         M = rows.shape[1]
         C = torch.full((M, 6, 6), torch.nan).double()
-        return Answer(EYE.repeat(M, 1, 1), replace(values, similarity=0.1 * rows), rows, C)
+        return JointPoses(EYE.repeat(M, 1, 1), replace(values, similarity=0.1 * rows), rows, C)
 
     def lost(self, _):
         there = [p.index for p in self.photographs]
