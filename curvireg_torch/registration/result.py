@@ -27,8 +27,7 @@ UNKNOWN_ROTATION = 1.0
 # Evidence of as many keypoints as a pose can begin from: they determine it, whatever its contours
 # tell
 DETERMINING_KEYPOINTS = math.log1p(FitSettings().min_keypoints - FitSettings().chance_keypoints)
-# Of :func:`.confidence.undetermined_axes`, from which the rotation is not determined of an object
-# that is not round
+# Of :func:`.confidence.undetermined_axes`, from which the rotation is not determined
 MOST_UNDETERMINED = 1.0
 # Fraction of the first pose's probability from which another one makes the answer ambiguous
 RIVAL_FRACTION = 0.5
@@ -352,9 +351,7 @@ class Registration:
         deviations = best.standard_deviations
         if deviations is None or not bool(deviations[0].isfinite().any()):
             return False
-        # of a nearly round object, the rotation about its axis may be left to small features
-        most = MOST_UNDETERMINED + (0.0 if self.axis is None else 1.0)
-        return (self.confidence_features.get("undetermined") or 0.0) < most
+        return (self.confidence_features.get("undetermined") or 0.0) < MOST_UNDETERMINED
 
     @property
     def _likely_meshes(self) -> list[int]:
