@@ -14,7 +14,6 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-import trimesh
 from torch import Tensor
 from tqdm import tqdm
 
@@ -25,6 +24,7 @@ from curvireg_torch.evidence import Evidence
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
+from curvireg_torch.mesh import Mesh
 from curvireg_torch.registration import Follower, camera, judging
 from curvireg_torch.registration.confidence import are_near
 from scripts._shared import read_json
@@ -233,7 +233,7 @@ def is_grey(kind: str, obj_id: int) -> bool:
     return kind in GREY and obj_id % GREY[kind] == 0
 
 
-def mesh_of(path: Path, *, grey: bool) -> trimesh.Trimesh:
+def mesh_of(path: Path, *, grey: bool) -> Mesh:
     """The mesh in a file, ``grey`` without its colours."""
     mesh = cr.load_mesh(path, unit="mm")
     return replace(mesh, colours=None) if grey else mesh

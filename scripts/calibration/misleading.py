@@ -25,6 +25,7 @@ scripts/results/misleading.json.
 import argparse
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -181,7 +182,8 @@ def measure(task: tuple[Path, list[str], list[int]]) -> list[Row]:
         registrars = [alone]
         if kind in ("sizes", "chosen"):
             # in both orders; the mesh of the photograph is the other one of a variant
-            other = mesh.copy().apply_scale(LARGER) if kind == "sizes" else original(folder, obj_id)
+            larger = replace(mesh, surface=mesh.surface.copy().apply_scale(LARGER))
+            other = larger if kind == "sizes" else original(folder, obj_id)
             pair = [alone.bank, cr.Registrar(other).bank]
             registrars = [cr.Registrar(pair), cr.Registrar(pair[::-1])]
         for sample in samples:

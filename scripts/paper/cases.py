@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import trimesh
 from torch import Tensor
 
 from curvireg_torch.data import read_image
@@ -17,7 +16,7 @@ from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.evaluation.bop import UNOCCLUDED
 from curvireg_torch.geometry import crop_images, rotation_towards
 from curvireg_torch.geometry.viewpoint import DEFAULT_DISTANCE
-from curvireg_torch.mesh import mesh_centre, mesh_radius
+from curvireg_torch.mesh import Mesh, mesh_centre, mesh_radius
 from curvireg_torch.pipeline import BankSettings
 
 
@@ -54,7 +53,7 @@ class Case:
             [image], self.box[None], size=settings.image_size, margin=settings.margin
         )[0]
 
-    def view(self, mesh: trimesh.Trimesh) -> tuple[Tensor, float]:
+    def view(self, mesh: Mesh) -> tuple[Tensor, float]:
         """Rotation (3, 3) and distance in model units of a camera that looks at the object's
         centre.
 

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import torch
-import trimesh
 from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
@@ -26,7 +25,7 @@ from curvireg_torch.filters.focus import PAPER_THRESHOLD
 from curvireg_torch.geometry import pose_from_box, rotation_error, viewpoint_from_rotation
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.matching.search import BEST_VIEWS, coherent_of, different_views, refine, search
-from curvireg_torch.mesh import load_mesh
+from curvireg_torch.mesh import Mesh, load_mesh
 from curvireg_torch.pipeline import FIELDS, PRESETS, BankSettings, Pipeline, ViewPolicy
 from scripts.paper.cases import Case
 from scripts.paper.detectors import DETECTORS
@@ -92,7 +91,7 @@ def photo_fields(variant: str) -> dict[str, nn.Module]:
 class Remembered:
     """A renderer of one mesh that renders every view once."""
 
-    def __init__(self, mesh: trimesh.Trimesh) -> None:
+    def __init__(self, mesh: Mesh) -> None:
         self._inner = ViewDescriber(mesh, BankSettings()).view_renderer
         self.name = self._inner.name
         self._known: dict[bytes, Tensor] = {}
@@ -134,7 +133,7 @@ def measure_points(cases: list[Case], settings: BankSettings) -> list[Record]:
 
 
 def _points_of(
-    case: Case, mesh: trimesh.Trimesh, describers: dict[str, ViewDescriber], settings: BankSettings
+    case: Case, mesh: Mesh, describers: dict[str, ViewDescriber], settings: BankSettings
 ) -> Record:
     crop = rgb_to_grayscale(case.crop(settings))
     R, distance = case.view(mesh)
@@ -320,7 +319,7 @@ def measure_focus(cases: list[Case], settings: BankSettings, pose: str) -> list[
 
 def _focus_of(
     cases: Sequence[Case],
-    mesh: trimesh.Trimesh,
+    mesh: Mesh,
     matcher: ViewMatcher,
     rotations: Tensor,
     azimuths: Tensor,
