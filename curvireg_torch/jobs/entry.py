@@ -9,10 +9,10 @@ from typing import Any
 
 from ..data import Photo, read_photo
 from ..data.frames import VideoFrame
-from ..data.poses import PoseFile
 from ..errors import CurviregError, InvalidInputError, MissingFileError
 from ..formats.boxes import PictureSize
 from ..formats.masks import mask_as_shown, mask_file
+from ..formats.poses import PoseRecord
 from ..geometry import Camera, camera_matrix
 from ..geometry.cameras import camera_of_view
 from ..geometry.pose_prior import PosePrior
@@ -42,7 +42,7 @@ class Entry:
     mask: Any = None  # of the object, instead of a box or beside it: a path, or pixels
     instances: int = 1  # without a box, see registration.detect
     prior: PosePrior | None = None
-    start: PoseFile | None = None  # the pose that is refined; nothing is searched for
+    start: PoseRecord | None = None  # the pose that is refined; nothing is searched for
     # other photographs, found together with this one, whose camera is their world
     views: tuple[RigView, ...] = ()
     # boxes refer to the pixels in the file; else the EXIF orientation is applied first
@@ -174,9 +174,9 @@ def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
     return None, None
 
 
-def start_in_unit(start: "PoseFile", unit: str | None) -> tuple[tuple[float, ...], ...]:
+def start_in_unit(start: "PoseRecord", unit: str | None) -> tuple[tuple[float, ...], ...]:
     """(4, 4) of a pose, with the translation in the ``unit`` of a mesh."""
-    T = start.T.clone()
+    T = start.T.copy()
     if start.unit is not None:
         T[:3, 3] *= UNITS[start.unit] / UNITS[unit or "m"]
     return tuple(map(tuple, T.tolist()))

@@ -30,10 +30,10 @@ from ..utils.choices import (
 )
 
 if TYPE_CHECKING:
-    from ..data.poses import PoseFile
     from ..features import LearnedCurvilinearSaliency
     from ..formats.boxes import BoxFile
     from ..formats.boxes.files import Corners
+    from ..formats.poses import PoseRecord
     from ..geometry import Camera
     from ..geometry.pose_prior import PosePrior
     from ..mesh import Mesh
@@ -333,7 +333,7 @@ class RegisterOptions:
         is no detector."""
         return None if self._box_file is None else self._box_file.of_frame(name, size)
 
-    def read_start(self) -> "PoseFile | None":
+    def read_start(self) -> "PoseRecord | None":
         """The pose of the file ``start``, or None."""
         if self.start is None:
             return None

@@ -5,7 +5,6 @@ import re
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch.data.poses import read_pose
@@ -18,7 +17,7 @@ QUATERNION = Rotation.from_matrix(R).as_quat().tolist()  # x, y, z, w
 
 
 def check(found, unit=None, confidence=None, expected=T):
-    torch.testing.assert_close(found.T, torch.from_numpy(expected), atol=1e-12, rtol=0)
+    np.testing.assert_allclose(found.T, expected, atol=1e-12, rtol=0)
     assert (found.unit, found.confidence) == (unit, confidence)
 
 

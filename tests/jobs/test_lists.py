@@ -12,8 +12,8 @@ import torch
 
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
-from curvireg_torch.data.poses import PoseFile
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.formats.poses import PoseRecord
 from curvireg_torch.jobs import lists, photograph, runner
 from curvireg_torch.jobs.entry import Entry, camera_of, observe, start_in_unit
 from curvireg_torch.jobs.lists import find_photographs, list_photographs, read_list
@@ -326,7 +326,9 @@ def test_a_start_pose_is_in_the_unit_of_the_mesh(unit, of_mesh, factor):
     """A mesh without a unit is in m; a pose without one is in that of the mesh."""
     T = torch.eye(4, dtype=torch.float64)
     T[:3, 3] = torch.tensor([20.0, -10.0, 600.0])
-    moved = torch.tensor(start_in_unit(PoseFile(T, unit=unit), of_mesh), dtype=torch.float64)
+    moved = torch.tensor(
+        start_in_unit(PoseRecord(T.numpy(), unit=unit), of_mesh), dtype=torch.float64
+    )
     torch.testing.assert_close(moved[:3, 3], factor * T[:3, 3])
     assert torch.equal(moved[:3, :3], T[:3, :3])
 

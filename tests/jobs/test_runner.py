@@ -5,12 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock, patch
 
+import numpy as np
 import pytest
 import torch
 
 from curvireg_torch import Camera, PosePrior
-from curvireg_torch.data.poses import PoseFile
 from curvireg_torch.errors import InvalidInputError, MeshError, WorkerError
+from curvireg_torch.formats.poses import PoseRecord
 from curvireg_torch.jobs import runner
 from curvireg_torch.jobs.entry import Entry
 from curvireg_torch.jobs.runner import run_entries
@@ -234,11 +235,11 @@ OTHERS = {
     "as_stored": True,
     "views": VIEWS,
 }
-OTHERS |= {"prior": PosePrior(distance=(1.0, 2.0)), "start": PoseFile(torch.eye(4))}
+OTHERS |= {"prior": PosePrior(distance=(1.0, 2.0)), "start": PoseRecord(np.eye(4))}
 STARTS = (
-    PoseFile(2.0 * torch.eye(4)),
-    PoseFile(torch.eye(4), unit="mm"),
-    PoseFile(torch.eye(4), confidence=0.5),
+    PoseRecord(2.0 * np.eye(4)),
+    PoseRecord(np.eye(4), unit="mm"),
+    PoseRecord(np.eye(4), confidence=0.5),
 )
 BOXES = ((1.0, 2.0, 3.0, 4.25), None)
 CAMERAS = (replace(CAMERA, size=(5, 6)), None, "exif", 50.0)
