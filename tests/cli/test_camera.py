@@ -168,18 +168,20 @@ def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, capsys)
 def test_a_photograph_is_decoded_and_undistorted_once(
     banks, located, folder, lens, tmp_path, monkeypatch
 ):
-    decoded = []
+    opened = []
     planes = []
-    decode = images._decode
+    decode = images.decoded
     remap = cv2.remap
-    monkeypatch.setattr(images, "_decode", lambda path: decoded.append(path) or decode(path))
+    monkeypatch.setattr(
+        images, "decoded", lambda path, *how: opened.append(path) or decode(path, *how)
+    )
     monkeypatch.setattr(cv2, "remap", lambda x, *a, **k: planes.append(x) or remap(x, *a, **k))
     meshes = [word for bank in banks for word in ("--mesh", str(folder / f"{bank}.safetensors"))]
     words = ["--box", *lens[0]] if located else []
     words += ["--no-refine", "--camera", str(folder / "cam.json"), "--quiet"]
     photo = str(folder / "distorted.png")
     assert main(["register", photo, *meshes, *words, "--out", str(tmp_path / "out")]) == 0
-    assert decoded == [folder / "distorted.png"]
+    assert opened == [folder / "distorted.png"]
     assert len(planes) == 3  # red, green and blue
 
 

@@ -99,13 +99,16 @@ def test_other_splits_have_no_targets_by_default(tree):
     assert len(BOPDataset(tree[0], "train_pbr")) == 4
 
 
-def test_a_missing_split_names_those_that_are_there(tree):
-    (tree[0] / "test").rename(tree[0] / "train_pbr")
+def test_a_missing_split_names_those_that_are_there(tmp_path):
+    folder = tmp_path / "sets" / "one"
+    folder.mkdir(parents=True)
+    write_bop(folder)
+    (folder / "test").rename(folder / "train_pbr")
     with pytest.raises(MissingFileError, match="the set has train_pbr: choose it as split"):
-        BOPDataset(tree[0])
+        BOPDataset(folder)
     with pytest.raises(MissingFileError, match=r"give the folder of one set: .*") as error:
-        BOPDataset(tree[0].parent)
-    assert str(tree[0]) in str(error.value)
+        BOPDataset(folder.parent)
+    assert str(folder) in str(error.value)
 
 
 def test_scenes_of_several_cameras_are_named(tree):

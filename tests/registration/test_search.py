@@ -271,10 +271,10 @@ def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh
     turn = rotation_from_viewpoint(70.0, 25.0, 40.0).double()
     T = torch.eye(4).double()
     T[:3, :3] = turn
-    copy = truck_bank().mesh.copy().apply_transform(T.numpy())
+    mesh = truck_bank().mesh
+    copy = replace(mesh, surface=mesh.surface.copy().apply_transform(T.numpy()))
     one, other = (
-        ViewBank.build(m, pipeline=PRESETS["paper"], progress=False)
-        for m in (truck_bank().mesh, copy)
+        ViewBank.build(m, pipeline=PRESETS["paper"], progress=False) for m in (mesh, copy)
     )
     torch.testing.assert_close(
         other.rotations.double() @ turn, one.rotations.double(), rtol=0, atol=1e-5
