@@ -21,6 +21,7 @@ __all__ = [
     "BoxesLike",
     "CalibratedCamera",
     "CameraLike",
+    "CleanMesh",
     "ImageLike",
     "ImagesLike",
     "MaskLike",
