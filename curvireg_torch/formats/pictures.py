@@ -60,7 +60,7 @@ def picture_size(path: Path) -> PictureSize:
     """The size of a photograph as :func:`read_photo` shows it, from its header; errors are the
     same."""
 
-    def stored_size(image: "Image", *_: object) -> Size:
+    def stored_size(image: "Image", *_: object) -> tuple[int, int]:
         # of a TIFF, whose size Pillow turns or not, by its version
         tags = getattr(image, "tag_v2", {})
         return int(tags.get(_WIDTH, image.width)), int(tags.get(_HEIGHT, image.height))
@@ -157,7 +157,7 @@ def _xmp(image: "Image") -> bytes:
     return found if isinstance(found, bytes) else str(found).encode()
 
 
-def _focal_by_sensor(directory: Mapping[int, Any], size: Size) -> float:
+def _focal_by_sensor(directory: Mapping[int, Any], size: tuple[int, int]) -> float:
     """The focal length in mm of a 36 x 24 mm camera of the same view, from that of the lens and the
     distance of the sensor's pixels; 0 where they are not stated, or no sensor has this size."""
     unit = _SENSOR_UNITS_MM[int(directory.get(_SENSOR_UNIT, 2))]

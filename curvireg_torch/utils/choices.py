@@ -97,8 +97,10 @@ def listed(names: Iterable[object], most: int = 8) -> str:
         >>> listed("abc", 2)
         'a, b, ...'
     """
-    texts = [*map(str, names)]
-    return ", ".join([*texts[:most], *["..."][: len(texts) - most > 0]])
+    texts = list(map(str, names))
+    if len(texts) > most:
+        texts[most:] = ["..."]
+    return ", ".join(texts)
 
 
 def _is_pattern(path: Path) -> bool:

@@ -16,7 +16,6 @@ from ..registration import Hypothesis, Registrar, Registration
 from ..registration.confidence import two_decimals
 from ..registration.photograph import Photograph, as_photograph
 from ..terms import crop_photographs, photograph_field
-from ..utils.aliases import Size
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, ImageLike
 from .contours import Drawn, close_up, draw_window, longer_side
@@ -131,9 +130,9 @@ def views_sheet(
 def _paste_tiles(
     sheet: Image.Image,
     tiles: Sequence[tuple[str, np.ndarray]],
-    corner: Size,
+    corner: tuple[int, int],
     columns: int,
-    size: Size,
+    size: tuple[int, int],
     line: int,
 ) -> None:
     """Paste pictures into a grid of cells of ``size`` (W, H), each with its caption below, ``line``
@@ -264,7 +263,7 @@ def _draw_caption(
     draw: ImageDraw.ImageDraw,
     registrar: Registrar,
     result: Registration,
-    corner: Size,
+    corner: tuple[int, int],
     size: int,
     note: str,
 ) -> None:

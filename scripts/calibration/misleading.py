@@ -182,8 +182,10 @@ def measure(task: tuple[Path, list[str], list[int]]) -> list[Row]:
         registrars = [alone]
         if kind in ("sizes", "chosen"):
             # in both orders; the mesh of the photograph is the other one of a variant
-            larger = replace(mesh, surface=mesh.surface.copy().apply_scale(LARGER))
-            other = larger if kind == "sizes" else original(folder, obj_id)
+            if kind == "sizes":
+                other = replace(mesh, surface=mesh.surface.copy().apply_scale(LARGER))
+            else:
+                other = original(folder, obj_id)
             pair = [alone.bank, cr.Registrar(other).bank]
             registrars = [cr.Registrar(pair), cr.Registrar(pair[::-1])]
         for sample in samples:

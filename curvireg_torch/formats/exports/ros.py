@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...errors import InvalidInputError
-from ...utils.aliases import Document, Size
+from ...utils.aliases import Document
 from ...utils.choices import UNITS
 from ...utils.files import write_file
 
@@ -19,7 +19,7 @@ OPTICAL_FRAME = "camera_optical_frame"
 ORDER = (3, 4, 5, 0, 1, 2)  # of x, y, z and rotations about them, among our rotations, x, y, z
 
 
-def time_stamp(text: str) -> Size:
+def time_stamp(text: str) -> tuple[int, int]:
     """Type of an option: seconds and nanoseconds.
 
     Example:
@@ -36,7 +36,7 @@ def write_ros(
     out: Path,
     document: Document,
     *,
-    stamp: Size = (0, 0),
+    stamp: tuple[int, int] = (0, 0),
     frame: str = OPTICAL_FRAME,
     child: str = "object",
 ) -> None:

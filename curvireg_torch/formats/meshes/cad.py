@@ -19,7 +19,6 @@ from ...errors import (
     MAX_MESH_BYTES,
     MAX_TEXTURE_PIXELS,
 )
-from ...utils.aliases import Size
 from ...utils.choices import UNITS
 from ...utils.extras import check_extras
 from ...utils.programs import run_program
@@ -201,7 +200,7 @@ def _check_copies(root: Any) -> None:
     are counted first."""
     named = {f"#{one.get('id')}": one for one in root.iter() if one.get("id")}
     nodes = {url: one for url, one in named.items() if local_name(one) == "node"}
-    known: dict[Any, Size] = {}
+    known: dict[Any, tuple[int, int]] = {}
     faces_of: dict[str, int] = {}
 
     def faces(url: str) -> int:
@@ -212,7 +211,7 @@ def _check_copies(root: Any) -> None:
             faces_of[url] = sum(map(_most_faces, shapes))
         return faces_of[url]
 
-    def count(node: Any, depth: int) -> Size:
+    def count(node: Any, depth: int) -> tuple[int, int]:
         if node in known:
             return known[node]
         if depth > 200:
