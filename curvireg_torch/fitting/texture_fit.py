@@ -86,17 +86,17 @@ def fit_texture(
     """Fit one pose to the mesh's colours and to contours together.
 
     The coloured mesh is drawn at the pose, and patches around its corners are searched in the
-    photograph by normalised correlation. Robust least squares move the pose to where most of them
-    are found, then to the edges as well; a second round searches nearer. The fit counts, and is not
-    None, if in the end more corners are in place than at the start, and enough of them, and the
-    edge support is as before.
+    photograph, both in grey, by normalised correlation. Robust least squares move the pose to where
+    most of them are found, then to the edges as well; a second round searches nearer. The fit
+    counts, and is not None, if in the end more corners are in place than at the start, and enough
+    of them, and the edge support is as before.
 
     ``draw`` gives (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a
     size (H, W). ``problem`` is that of one pose at full size, without a mask, ``photograph`` (C, S,
     S) its crop; ``starts`` (N, 4, 4) are those of
     :func:`rotated_starts`.
     """
-    texture = _TextureRounds(draw, renderer, problem, _as_array(photograph))
+    texture = _TextureRounds(draw, renderer, problem, _grey(photograph))
     support = problem.edge_support(problem.state(starts[:1]))
     rounds = [texture.round(start, *FAR_ROUND) for start in starts.split(1)]
     coarse = max(
@@ -153,8 +153,8 @@ class _Round:
 
 @dataclass(frozen=True)
 class _TextureRounds:
-    """One ``photograph`` (S, S, 3) float32 of a contour problem, and the means to draw the mesh
-    into it."""
+    """One ``photograph`` (S, S) in grey of a contour problem, and the means to draw the mesh into
+    it."""
 
     draw: Draw
     renderer: DepthRenderer
@@ -183,11 +183,11 @@ class _TextureRounds:
         few."""
         problem = self.problem
         size = (self.problem.size, self.problem.size)
-        view = _as_array(self.draw(T, problem.K, size)[0])
+        view = _grey(self.draw(T, problem.K, size)[0])
         depth = self.renderer.render(T, problem.K, size).cpu()
-        grey = (255.0 * view.mean(axis=2)).round().astype(np.uint8)
+        levels = (255.0 * view).round().astype(np.uint8)
         corners, model = surface_corners(
-            grey, depth, T, problem.K, quality=CORNER_QUALITY, inside=HALF_PATCH
+            levels, depth, T, problem.K, quality=CORNER_QUALITY, inside=HALF_PATCH
         )
         if len(corners) < MIN_MATCHES:
             return None
@@ -199,16 +199,16 @@ class _TextureRounds:
         )
 
 
-def _as_array(picture: Tensor) -> np.ndarray:
-    """(S, S, 3) float32 of (C, S, S), C = 1 or 3."""
-    return np.ascontiguousarray(picture.expand(3, -1, -1).permute(1, 2, 0).float().numpy())
+def _grey(picture: Tensor) -> np.ndarray:
+    """(S, S) float32 of a picture (C, S, S): the mean of its channels."""
+    return picture.float().mean(dim=0).numpy()
 
 
 def match_patches(
     view: np.ndarray, photograph: np.ndarray, corners: np.ndarray, radius: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Offsets (C, 2) in px to where patches of a view correlate most within a ``radius`` of the
-    photograph, both (S, S, 3) float32, around ``corners`` (C, 2), and weights (C,) in [0, 1] of
+    photograph, both (S, S) float32, around ``corners`` (C, 2), and weights (C,) in [0, 1] of
     these matches."""
     border = HALF_PATCH + radius
     padded = cv2.copyMakeBorder(photograph, border, border, border, border, cv2.BORDER_REFLECT)

@@ -7,14 +7,13 @@ from torch import Tensor
 
 from ..mesh.colours import colours_at
 from ..mesh.mesh import as_mesh
-from ..utils.checks import check_camera_matrix, check_image, check_tensor
+from ..utils.checks import check_camera_matrix, check_image, check_integer, check_tensor
 from ..utils.likes import MeshLike
 from .depth import make_renderer
 from .renderer import DepthRenderer, check_render_arguments
 
 AMBIENT = 0.3  # Grey level of a surface seen edge on; the background is 1
 LIT = 0.9  # Grey level of a surface seen face on
-SUPERSAMPLING = 2  # Samples per pixel and axis, because textures are finer than views
 
 
 @torch.no_grad()
@@ -26,10 +25,12 @@ def render_colour(
     *,
     renderer: str | DepthRenderer = "auto",
     orthographic: bool = False,
+    supersampling: int = 2,
 ) -> Tensor:
-    """Pictures of a mesh in its colours before white: the colour times :func:`shade`, four samples
-    per pixel. A mesh without colours is white, and so is every mesh with a renderer that does not
-    report which face a pixel shows; "auto" and "embree" do. Arguments and errors are those of
+    """Pictures of a mesh in its colours before white: the colour times :func:`shade`, with
+    ``supersampling`` samples per pixel and axis, because textures are finer than views. A mesh
+    without colours is white, and so is every mesh with a renderer that does not report which face a
+    pixel shows; "auto" and "embree" do. The other arguments and errors are those of
     :func:`render_depth`.
 
     Returns:
@@ -47,10 +48,11 @@ def render_colour(
     """
     mesh = as_mesh(mesh)
     T, K = check_render_arguments(T_cam_from_model.view(-1, 4, 4), camera_matrix, size)
-    shift = 0.5 - 0.5 / SUPERSAMPLING
-    zoom = torch.tensor([[1.0, 0, shift], [0, 1, shift], [0, 0, 1 / SUPERSAMPLING]])
-    K = SUPERSAMPLING * zoom.double() @ K
-    fine = SUPERSAMPLING * size[0], SUPERSAMPLING * size[1]
+    check_integer(supersampling, "supersampling")
+    shift = 0.5 - 0.5 / supersampling
+    zoom = torch.tensor([[1.0, 0, shift], [0, 1, shift], [0, 0, 1 / supersampling]])
+    K = supersampling * zoom.double() @ K
+    fine = supersampling * size[0], supersampling * size[1]
     backend = make_renderer(mesh, renderer)
     colours = mesh.colours
     faces_at = getattr(backend, "faces_at", None)
@@ -64,7 +66,7 @@ def render_colour(
     picture = shade(depth, K, orthographic=orthographic) * torch.from_numpy(albedo).permute(
         0, 3, 1, 2
     )
-    return F.avg_pool2d(picture.contiguous(), SUPERSAMPLING)
+    return F.avg_pool2d(picture.contiguous(), supersampling)
 
 
 def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -> Tensor:

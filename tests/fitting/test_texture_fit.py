@@ -51,7 +51,7 @@ def turned_can(degrees):
 
 def fit(renderer, image, starts, mesh=MESH):
     def draw(T, K, size):
-        return render_colour(mesh, T, K, size, renderer=renderer)
+        return render_colour(mesh, T, K, size, renderer=renderer, supersampling=1)
 
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
     crops = EdgeCrops.cut([image], box.float(), 0.1)
@@ -158,14 +158,14 @@ def test_label_does_not_pull_a_pose_out_of_its_limits():
 
 def test_match_finds_patches_that_moved_by_fractions_of_pixels_unless_they_slide_along_an_edge():
     rng = np.random.default_rng(0)
-    view = cv2.GaussianBlur(rng.random((96, 96, 3)).astype(np.float32), (0, 0), 2.0)
+    view = cv2.GaussianBlur(rng.random((96, 96)).astype(np.float32), (0, 0), 2.0)
     shift = np.array([[1, 0, 3.3], [0, 1, -4.6]])
     # in other light
     photograph = 0.2 + 0.5 * cv2.warpAffine(view, shift, (96, 96), flags=cv2.INTER_CUBIC)
     offset, weight = match_patches(view, photograph, np.array([[30, 40], [48, 50], [60, 36]]), 8)
     assert np.abs(offset - (3.3, -4.6)).max() < 0.1
     assert weight.min() > 0.9
-    view = np.zeros((96, 96, 3), np.float32)
+    view = np.zeros((96, 96), np.float32)
     view[48:] = 1.0
     _, weight = match_patches(view, view, np.array([[48, 48]]), 8)
     assert weight.tolist() == [0.0]

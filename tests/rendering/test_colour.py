@@ -107,6 +107,8 @@ def test_render_colour_is_grey_without_colours_or_faces():
     assert (grey[:, 0] == grey[:, 1]).all()
     assert (grey - render_colour(mesh, T, K, SIZE)).abs().mean() > 0.05
     assert render_colour(mesh, T[:0], K, SIZE).shape == (0, 3, *SIZE)
+    single = render_colour(bare, T, K, SIZE, supersampling=1)
+    assert (single == shade(make_renderer(bare).render(T, K, SIZE), K)).all()
 
 
 def test_cleaning_preserves_vertex_and_face_colours():
