@@ -215,7 +215,9 @@ def work(folder, tasks):
     time.sleep(300)
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
+    # a shell ignores the first for jobs in the background, nohup the second
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     with terminable(), Workers(2) as workers:
         list(workers.map(work, Path(sys.argv[1]), [[1], [2]]))
 """
