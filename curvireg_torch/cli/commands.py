@@ -288,11 +288,10 @@ def draw(arguments: argparse.Namespace) -> None:
             f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}"
         )
     load_libraries()
-    from ..data import read_photo
-    from ..jobs.entry import entry_of, observe
+    from ..jobs.entry import entry_of, prepare
     from ..jobs.opening import open_registrar
     from ..jobs.outputs import check_output_file
-    from ..jobs.photograph import register_observation
+    from ..jobs.photograph import register_entry
     from ..utils.threads import one_torch_thread
     from ..visualization import plots
 
@@ -300,15 +299,15 @@ def draw(arguments: argparse.Namespace) -> None:
     check_output_file(
         arguments.out, input_files(arguments, arguments.photo, arguments.mesh), mark=b"curvireg"
     )
-    photo = read_photo(arguments.photo)
+    entry = entry_of(arguments.photo, options)
+    photograph = prepare(entry)
     with one_torch_thread():
         registrar = open_registrar(options, options.meshes)
-        observation = observe(entry_of(arguments.photo, options), photo)
-        found = register_observation(observation, registrar)
+        found = register_entry(entry, photograph, registrar)
         if arguments.kind == "viewpoints":
             figure = plots.viewpoints(registrar.bank, found)
         elif arguments.kind == "fields":
-            figure = plots.fields(registrar, found, found.image, found.box)
+            figure = plots.fields(registrar, found, found.photograph)
         else:
             figure = found.plot()
     content = BytesIO()
@@ -338,11 +337,10 @@ def demo(arguments: argparse.Namespace) -> None:
     """Generate a photograph of the example mesh, register it and print the error."""
     out = arguments.out
     load_libraries()
-    from ..data import read_photo
     from ..geometry import Camera, rotation_error
-    from ..jobs.entry import entry_of, observe
+    from ..jobs.entry import entry_of, prepare
     from ..jobs.outputs import output_folder
-    from ..jobs.photograph import register_observation
+    from ..jobs.photograph import register_entry
     from ..synthetic import demo_scene
     from ..utils.threads import one_torch_thread
     from ..visualization.encoding import png, to_uint8
@@ -358,9 +356,7 @@ def demo(arguments: argparse.Namespace) -> None:
         )
         with opened_registrar(options) as (registrar, seconds):
             entry = entry_of(out / "photo.png", options)
-            photo = read_photo(out / "photo.png")
-            observation = observe(entry, photo)
-            found = register_observation(observation, registrar, bank_seconds=seconds)
+            found = register_entry(entry, prepare(entry), registrar, bank_seconds=seconds)
         assert found.translation is not None
         R = scene.truth[:3, :3]
         t = scene.truth[:3, 3]

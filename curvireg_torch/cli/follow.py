@@ -33,11 +33,12 @@ from .options import (
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from ..data import Photo
     from ..geometry import Camera
     from ..jobs.options import RegisterOptions
     from ..registration import FailedRegistration, Registrar, Registration
 
-    Frame = tuple[str, Tensor | ImageError]  # its name, and its pixels or why they cannot be read
+    Frame = tuple[str, Photo | ImageError]  # its name, and its pixels or why they cannot be read
 
 FOLDER_FPS = 10.0  # frames per second of the overlay of a folder, or of a camera that does not tell
 
@@ -276,12 +277,13 @@ def _poses(
     follow = None
     prior = prior_from_limits(options.limits or {})
     is_first = True
-    for name, image in frames:
+    for name, photo in frames:
         begun = time.perf_counter()
-        result = None
-        if isinstance(image, ImageError):
-            yield name, None, FailedRegistration(image), time.perf_counter() - begun
+        if isinstance(photo, ImageError):
+            yield name, None, FailedRegistration(photo), time.perf_counter() - begun
             continue
+        image = photo.image
+        result: Registration | FailedRegistration
         try:
             box: Any = _box(options, name, image, is_first=is_first)
             is_first = False
@@ -292,7 +294,7 @@ def _poses(
                 image = seen.image
                 box = seen.box
             if follow is None:
-                follow = Follower(registrar, _camera(options, image), prior=prior)
+                follow = Follower(registrar, _camera(options, photo), prior=prior)
                 if (start := options.read_start()) is not None:
                     pose = start_in_unit(start, registrar.bank.mesh.unit)
                     follow.start(
@@ -323,22 +325,14 @@ def _box(
     return next((list(box) for box in found if box is not None), None)
 
 
-def _camera(options: "RegisterOptions", image: "Tensor") -> "Camera | None":
+def _camera(options: "RegisterOptions", photo: "Photo") -> "Camera | None":
     """The given camera without its distortion, or that of the first frame by its EXIF or the field
     of view, which frames of other sizes scale; None if it is not known."""
-    from ..data import Photo, read_photo
     from ..geometry import Camera
     from ..jobs.entry import camera_of, entry_of
-    from ..jobs.lists import find_photographs
 
-    source = options.photos[0]
-    photo = Photo(image, 1, None, ())
-    if source.is_dir():
-        source = find_photographs(source)[0]
-        with suppress(CurviregError, OSError):
-            photo = read_photo(source)
     without_box = replace(options, box=None, boxes=None)
-    camera, _ = camera_of(entry_of(source, without_box), photo)
+    camera, _ = camera_of(entry_of(options.photos[0], without_box), photo)
     if camera is None:
         return None
     if not isinstance(options.camera, Camera):  # a guess is one for frames of this size
@@ -348,14 +342,14 @@ def _camera(options: "RegisterOptions", image: "Tensor") -> "Camera | None":
 
 def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:
     """The frames of a video or a folder, their number, and frames per second."""
-    from ..data import Video, read_photo
+    from ..data import Photo, Video, read_photo
     from ..data.images import ANIMATED
     from ..jobs.lists import find_photographs, is_video
 
     if is_video(path):
         video = Video(path)
         return (
-            ((f"{path.stem}-{number:06d}", image) for number, image in video),
+            ((f"{path.stem}-{number:06d}", Photo(image)) for number, image in video),
             video.count,
             video.fps,
         )
@@ -367,7 +361,7 @@ def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:
                 photo = read_photo(name)
                 if len(photos) == 1 and ANIMATED in photo.notes:
                     raise ImageError("an animation; save it as MP4, or its pictures in a folder")
-                yield str(name), photo.image
+                yield str(name), photo
             except (CurviregError, OSError) as error:
                 yield str(name), ImageError(str(error))
 
@@ -379,7 +373,7 @@ def _live(source: str) -> tuple[Iterator["Frame"], None, float]:
     none is late."""
     import cv2
 
-    from ..data.images import frame_tensor
+    from ..data.images import Photo, frame_tensor
 
     file = cv2.VideoCapture(int(source) if source.isdecimal() else source)
     if not file.isOpened():
@@ -408,7 +402,7 @@ def _live(source: str) -> tuple[Iterator["Frame"], None, float]:
             while reader.is_alive() or not latest.empty():
                 with suppress(Empty):
                     number, pixels = latest.get(timeout=0.2)
-                    yield f"frame-{number:06d}", frame_tensor(pixels)
+                    yield f"frame-{number:06d}", Photo(frame_tensor(pixels))
         finally:
             ended.set()
             reader.join(timeout=5.0)

@@ -336,18 +336,15 @@ def _photographs_of_rig(arguments: argparse.Namespace) -> Iterator[Path]:
 
 def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
     """Register one photograph, write and print the result; returns whether it is reliable."""
-    from ..data import read_photo
-    from ..geometry import Camera
-    from ..jobs.entry import entry_of, observe
-    from ..jobs.photograph import register_observation
+    from ..jobs.entry import entry_of, prepare
+    from ..jobs.photograph import register_entry
     from ..jobs.result_files import write_lost
     from ..visualization.words import camera_in_words
 
     out = arguments.out
     path = options.photos[0]
-    photo = read_photo(path)
     entry = entry_of(path, options)
-    observation = observe(entry, photo)
+    photograph = prepare(entry)
     if options.progress and not (options.box or options.boxes or options.mask or options.start):
         print(
             f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable",
@@ -355,7 +352,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
         )
     with opened_registrar(options) as (registrar, seconds):
         try:
-            found = register_observation(observation, registrar, bank_seconds=seconds)
+            found = register_entry(entry, photograph, registrar, bank_seconds=seconds)
         except LostObjectError as error:
             if out is not None:
                 write_lost(out, str(error))
@@ -365,8 +362,8 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     _write_pose(arguments, found.document, found.registrar.of_mesh(found.mesh_index))
     for warning in found.warnings:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
-    remarks = [*photo.notes, *camera_in_words(found.document)]
-    if isinstance(options.camera, Camera) and options.camera.distorts:
+    remarks = [*photograph.facts["picture"]["notes"], *camera_in_words(found.document)]
+    if photograph.camera is not None and photograph.camera.distorts:
         remarks.append(
             "distortion of the lens removed: boxes and overlay.png are of the undistorted "
             "photograph"
@@ -383,15 +380,17 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
 def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
     """Register the photographs of a rig together, write and print the result; returns whether it is
     reliable."""
+    from ..jobs.photograph import prepare_views
     from ..jobs.result_files import write_views
     from ..jobs.rigs import read_rig, register_rig
     from ..visualization.words import view_in_words
 
     out = arguments.out
     rig = read_rig(arguments.views, options.meshes[0])
+    photographs = prepare_views(rig)
     with opened_registrar(options) as (registrar, seconds):
-        result, document, photographs = register_rig(
-            arguments.views, rig, registrar, bank_seconds=seconds
+        result, document = register_rig(
+            arguments.views, rig, photographs, registrar, bank_seconds=seconds
         )
     document["mesh"] = str(options.meshes[result.mesh_index])
     if out is not None:

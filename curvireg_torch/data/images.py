@@ -68,15 +68,15 @@ class Photo:
         is_stitched: whether the file says that it is a panorama.
 
     Example:
-        >>> photo = Photo(torch.zeros(3, 48, 64, dtype=torch.uint8), 1, 28.0, ())
+        >>> photo = Photo(torch.zeros(3, 48, 64, dtype=torch.uint8), focal_35mm=28.0)
         >>> round(float(photo.camera().matrix[0, 0]))
         52
     """
 
     image: Tensor
-    orientation: int
-    focal_35mm: float | None
-    notes: tuple[str, ...]
+    orientation: int = 1
+    focal_35mm: float | None = None
+    notes: tuple[str, ...] = ()
     taken_size: Size | None = None
     digital_zoom: float = 1.0
     is_stitched: bool = False

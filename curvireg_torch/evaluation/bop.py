@@ -13,10 +13,10 @@ from torch import Tensor
 
 from ..data import BOPDataset
 from ..data.bop_models import model_files, read_models_info
-from ..geometry import Camera, symmetry_transforms
+from ..geometry import symmetry_transforms
 from ..geometry.cameras import transform
+from ..jobs.entry import Entry
 from ..jobs.store import Row
-from ..jobs.views import RigView
 from ..mesh import load_mesh
 from ..utils.files import write_csv
 from . import metrics
@@ -70,7 +70,7 @@ class BOPBenchmark(Benchmark):
                 for i, others in zip(group, views, strict=True):
                     self.entries[i] = replace(self.entries[i], views=others)
 
-    def _views(self, first: int, group: Sequence[int]) -> tuple[RigView, ...]:
+    def _views(self, first: int, group: Sequence[int]) -> tuple[Entry, ...]:
         """Photographs drawn from those of ``group`` to be registered together with that of the
         sample ``first``."""
         image = self.samples[first]["image_id"]
@@ -79,7 +79,7 @@ class BOPBenchmark(Benchmark):
         order = torch.randperm(len(others), generator=generator).tolist()[: self.protocol.views - 1]
         return tuple(self._other_view(first, others[k]) for k in order)
 
-    def _other_view(self, first: int, other: int) -> RigView:
+    def _other_view(self, first: int, other: int) -> Entry:
         entry, (one, two) = self.entries[other], (self.samples[i] for i in (first, other))
         T_one = one["T_cam_from_world"].double()
         T_two = two["T_cam_from_world"].double()
@@ -88,9 +88,9 @@ class BOPBenchmark(Benchmark):
             T_one, T_two = (
                 transform(s["rotation"].double(), s["translation"].double()) for s in (one, two)
             )
-        assert isinstance(entry.camera, Camera)
         box = None if entry.error else entry.box
-        return RigView(entry.name, entry.photo, box, entry.camera, T_two @ torch.linalg.inv(T_one))
+        T = T_two @ torch.linalg.inv(T_one)
+        return replace(entry, box=box, prior=None, T_cam_from_world=T)
 
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
         """Rotation errors in degrees, ADD(-S) and MSSD in diameters, MSPD in image widths."""

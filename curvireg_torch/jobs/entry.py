@@ -1,11 +1,12 @@
 """One photograph with what is known about it, before it is registered."""
 
-import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
+
+from torch import Tensor
 
 from ..data import Photo, read_photo
 from ..data.frames import VideoFrame
@@ -21,7 +22,6 @@ from ..utils.choices import UNITS
 from ..utils.files import file_digest, text_digest
 from ..utils.likes import BoxLike
 from .options import RegisterOptions, prior_from_limits
-from .views import RigView
 
 # standard deviation of the focal length of a given field of view, as a fraction of it
 VIEW_DEVIATION = 0.1
@@ -44,7 +44,8 @@ class Entry:
     prior: PosePrior | None = None
     start: PoseRecord | None = None  # the pose that is refined; nothing is searched for
     # other photographs, found together with this one, whose camera is their world
-    views: tuple[RigView, ...] = ()
+    views: tuple["Entry", ...] = ()
+    T_cam_from_world: Tensor | None = None  # (4, 4) of a view, lengths in the mesh's unit
     # boxes refer to the pixels in the file; else the EXIF orientation is applied first
     as_stored: bool = False
     label: str = ""  # of a dataset's object: a name that no other object has
@@ -56,10 +57,7 @@ class Entry:
         prior = None if self.prior is None else self.prior.to_dict()
         camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
         given = [self.name, self.box, camera, self.instances, prior]
-        views = [
-            (view.box, view.camera.describe(), view.T_cam_from_world.tolist())
-            for view in self.views
-        ]
+        views = [(view.request(), view.in_world[1].tolist()) for view in self.views]
         mask = [] if self.mask is None else [str(self.mask), file_digest(mask_file(self.mask)[0])]
         start = (
             None
@@ -68,10 +66,17 @@ class Entry:
         )
         return [*given, start, views, self.as_stored, *mask]
 
+    @property
+    def in_world(self) -> tuple[Camera, Tensor]:
+        """Camera and ``T_cam_from_world`` of one of several photographs."""
+        assert isinstance(self.camera, Camera)
+        assert self.T_cam_from_world is not None
+        return self.camera, self.T_cam_from_world
+
     def read(self) -> Photo:
         """The photograph, or the frame; errors are those of :func:`read_photo`."""
         if self.frame is not None:
-            return Photo(self.frame.read(), 1, None, ())
+            return Photo(self.frame.read())
         return read_photo(self.photo, as_stored=self.as_stored)
 
     @property
@@ -106,31 +111,10 @@ def entry_of(photo: Path, options: RegisterOptions) -> Entry:
     )
 
 
-@dataclass(frozen=True)
-class Observation:
-    """A photograph of an entry, prepared once for all meshes.
-
-    Attributes:
-        entry: what is known about the photograph.
-        photo: as it was read.
-        camera: as given, with the distortion of its lens; None if it is unknown.
-        camera_source: where the camera is from.
-        item: the photograph and its box and mask without distortion.
-        seconds: that preparing it took.
-    """
-
-    entry: Entry
-    photo: Photo
-    camera: Camera | None
-    camera_source: str | None
-    item: Photograph
-    seconds: float
-
-
-def observe(entry: Entry, photo: Photo) -> Observation:
-    """Prepare the photograph of an entry; refuses what cannot be used, as before meshes are
-    opened."""
-    start = time.perf_counter()
+def prepare(entry: Entry, photo: Photo | None = None) -> Photograph:
+    """The photograph of an entry, by default that of its file, once for all meshes; refuses what
+    cannot be used, before meshes are opened."""
+    photo = entry.read() if photo is None else photo
     if isinstance(entry.mask, str | PathLike) and not mask_file(entry.mask)[0].is_file():
         raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
     camera, source = camera_of(entry, photo)
@@ -140,8 +124,7 @@ def observe(entry: Entry, photo: Photo) -> Observation:
     item = as_photographs([photo.image], boxes, camera, entry.prior, masks)[0]
     if isinstance(item, CurviregError):
         raise item.with_subject(entry.name)
-    seconds = time.perf_counter() - start
-    return Observation(entry, photo, camera, source, item, seconds)
+    return replace(item, facts={"camera_source": source, "picture": photo.facts()})
 
 
 def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:

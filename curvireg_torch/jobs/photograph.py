@@ -23,18 +23,18 @@ from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.detection import detect_prepared
 from ..registration.hypotheses import projected_box
-from ..registration.photograph import as_photograph
+from ..registration.photograph import Photograph, as_photograph
 from ..registration.refinement import refine_prepared
 from ..registration.registrar import ObjectLike, Results
+from ..registration.several import register_prepared_views
 from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
 from .documents import detection_document, result_document
-from .entry import Entry, Observation, observe, start_in_unit
+from .entry import Entry, prepare, start_in_unit
 from .opening import load_bank
 from .outputs import output_folder
 from .result_files import write_result
-from .views import RigView, register_views
 
 __all__ = ["RegisteredPhotograph", "register"]
 
@@ -47,24 +47,32 @@ class RegisteredPhotograph(Registration):
 
     Attributes:
         registrar: of the mesh.
-        image, box: the photograph, without distortion; (4,) x0, y0, x1, y1 in px in which the
-            object was found.
+        photograph: without distortion, with the box in which the object was found.
         document: the content of ``result.json``.
         inputs: files that were read.
         copies: further objects that were found in the photograph, by decreasing confidence.
     """
 
     registrar: Registrar
-    image: Tensor
-    box: Tensor
+    photograph: Photograph
     document: dict[str, Any]
     inputs: tuple[Path, ...] = ()
     copies: tuple[Registration, ...] = ()
 
+    @property
+    def image(self) -> Tensor:
+        """(1 or 3, H, W) of the photograph, without distortion."""
+        return self.photograph.image
+
+    @property
+    def box(self) -> Tensor:
+        """(4,) x0, y0, x1, y1 in px in which the object was found."""
+        return self.photograph.box
+
     def overlay(self) -> np.ndarray:
         """(H, W, 3) uint8 RGB: the photograph with the contours of the mesh at the pose, and the
         box; those of ``copies`` too."""
-        return contour_overlay(self.registrar, self, self.image, self.box, copies=self.copies)
+        return contour_overlay(self.registrar, self, self.photograph, copies=self.copies)
 
     def plot(self) -> Any:
         """The overlay as a ``matplotlib.figure.Figure``; needs matplotlib."""
@@ -86,7 +94,7 @@ class RegisteredPhotograph(Registration):
         """Write the files of :meth:`save` into a folder that :func:`.outputs.output_folder` has
         checked."""
         write_result(
-            folder, self.document, self.registrar, self, self.image, self.box, copies=self.copies
+            folder, self.document, self.registrar, self, self.photograph, copies=self.copies
         )
 
     def _repr_html_(self) -> str:
@@ -149,7 +157,7 @@ def register(
     elif isinstance(image, Image.Image):
         photo = photo_of_picture(image)
     else:
-        photo = Photo(as_photograph(image, None).image, 1, None, ())
+        photo = Photo(as_photograph(image, None).image)
     if isinstance(mesh, str | PathLike):
         entry = replace(entry, meshes=(Path(mesh),))
         load = load_bank if Path(mesh).suffix == ".safetensors" else load_mesh
@@ -160,7 +168,7 @@ def register(
         )
     if not isinstance(mesh, Registrar):
         mesh = Registrar(mesh, pipeline=pipeline, progress=progress)
-    return register_observation(observe(entry, photo), mesh)
+    return register_entry(entry, prepare(entry, photo), mesh)
 
 
 def _camera(given: CameraLike | str | PathLike[str] | None) -> Camera | str | None:
@@ -174,22 +182,23 @@ def _camera(given: CameraLike | str | PathLike[str] | None) -> Camera | str | No
     return Camera(camera_matrix(*K) if is_short else K)
 
 
-def register_observation(
-    observation: Observation, registrar: Registrar, *, bank_seconds: float = 0.0
+def register_entry(
+    entry: Entry, photograph: Photograph, registrar: Registrar, *, bank_seconds: float = 0.0
 ) -> RegisteredPhotograph:
     """Register one photograph with the registrar of its meshes, which took ``bank_seconds`` to
     open."""
-    (found,) = register_observations([observation], registrar, bank_seconds=bank_seconds)
+    (found,) = register_entries([(entry, photograph)], registrar, bank_seconds=bank_seconds)
     if isinstance(found, CurviregError):
         raise found
     return found
 
 
-def register_observations(
-    observations: Sequence[Observation], registrar: Registrar, *, bank_seconds: float = 0.0
+def register_entries(
+    entries: Sequence[tuple[Entry, Photograph]], registrar: Registrar, *, bank_seconds: float = 0.0
 ) -> list[RegisteredPhotograph | CurviregError]:
-    """Register photographs with the registrar of their meshes, which took ``bank_seconds`` to open;
-    those with boxes together. One that cannot be registered has its error.
+    """Register entries, each with its photograph, with the registrar of their meshes, which took
+    ``bank_seconds`` to open; those with boxes together. One that cannot be registered has its
+    error.
 
     The ``document`` of a result is the content of ``result.json``, and of a line of
     ``results.jsonl``; its seconds are those of the photograph and its share of those of the call.
@@ -197,74 +206,92 @@ def register_observations(
     start = time.perf_counter()
     located = [
         place
-        for place, observation in enumerate(observations)
-        if observation.entry.start is None
-        and not observation.entry.views
-        and (observation.entry.box is not None or observation.entry.mask is not None)
+        for place, (entry, item) in enumerate(entries)
+        if entry.start is None and not entry.views and item.has_box
     ]
-    items = [observations[place].item for place in located]
+    items = [entries[place][1] for place in located]
     results: dict[int, Results] = {
         place: [result]
         for place, result in zip(located, registrar.register_prepared(items), strict=True)
     }
     seconds = (time.perf_counter() - start) / max(len(located), 1)
     found: list[RegisteredPhotograph | CurviregError] = []
-    for place, observation in enumerate(observations):
+    for place, (entry, item) in enumerate(entries):
         start = time.perf_counter()
         try:
             known = results.get(place)
-            answers = _results_of(observation, registrar) if known is None else known
+            answers = _results_of(entry, item, registrar) if known is None else known
             taken = time.perf_counter() - start if known is None else seconds
             spent = {"bank": 0.0 if place else bank_seconds, "register": taken}
-            found.append(_registered(observation, registrar, answers, spent))
+            found.append(_registered(entry, item, registrar, answers, spent))
         except CurviregError as error:
             found.append(error)
     return found
 
 
-def _results_of(observation: Observation, registrar: Registrar) -> Results:
+def _results_of(entry: Entry, item: Photograph, registrar: Registrar) -> Results:
     """The registrations of a photograph with a start, with further views, or without a box."""
-    entry = observation.entry
-    camera = observation.camera
-    item = observation.item
+    alone = replace(item, prior=None)
     if entry.start is not None:
         start_pose = start_in_unit(entry.start, registrar.bank.mesh.unit)
         confidences = [entry.start.confidence]
-        alone = replace(item, prior=None)
         return refine_prepared(registrar, [alone], [start_pose], start_confidences=confidences)
     if entry.views:
-        assert camera is not None  # of datasets with cameras only
-        world = torch.eye(4, dtype=torch.float64)
-        pixels = observation.photo.image
-        first = RigView(entry.name, entry.photo, entry.box, camera, world, pixels)
-        together, _ = register_views([first, *entry.views], registrar, as_stored=entry.as_stored)
+        first = replace(entry, T_cam_from_world=torch.eye(4, dtype=torch.float64))
+        views = [first, *entry.views]
+        together = register_views(views, [alone, *prepare_views(entry.views)], registrar)
         best, *others = together.hypotheses
-        best = replace(
-            best, projection=(together.views[0].T_cam_from_model, camera.at(item.size).matrix)
-        )
-        return [replace(together, hypotheses=(best, *others))]
+        best = replace(best, projection=(together.views[0].T_cam_from_model, item.K))
+        return [replace(together, hypotheses=(best, *others), camera=item.pinhole)]
     if entry.instances > 1:
         return detect_prepared(registrar, [item], instances=entry.instances)[0]
     return registrar.register_prepared([item], detects=True)
 
 
+def prepare_views(views: Sequence[Entry]) -> list[Photograph | CurviregError]:
+    """The photographs of several entries, or why one cannot be used: others may do without it."""
+    found: list[Photograph | CurviregError] = []
+    for view in views:
+        try:
+            found.append(prepare(view))
+        except CurviregError as error:
+            found.append(error)
+    return found
+
+
+def register_views(
+    views: Sequence[Entry],
+    photographs: Sequence[Photograph | CurviregError],
+    registrar: Registrar,
+) -> Registration:
+    """Register several photographs of one object together, see :meth:`.Registrar.register_views`;
+    errors call them by their names."""
+    T = torch.stack([view.in_world[1] for view in views])
+    try:
+        return register_prepared_views(registrar, photographs, T)
+    except CurviregError as error:
+        raise error.with_image_names([view.name for view in views]) from error
+
+
 def _registered(
-    observation: Observation, registrar: Registrar, results: Results, seconds: dict[str, float]
+    entry: Entry,
+    item: Photograph,
+    registrar: Registrar,
+    results: Results,
+    seconds: dict[str, float],
 ) -> RegisteredPhotograph:
     """The first of the results, with its document and the others as copies."""
-    entry = observation.entry
-    camera = observation.camera
-    item = observation.item
     result = results[0]
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject(entry.name)
     box = item.box
-    K = item.camera_matrix
     if result.detection is not None:
         box = result.detection.box
-    elif entry.box is None and entry.mask is None:
+    elif not item.has_box:
         box = projected_box(registrar.of_mesh(result.mesh_index).describer, result.projection)
-    seconds = {**seconds, "register": observation.seconds + seconds["register"]}
+    camera = result.camera
+    if camera is not None and item.camera is not None:
+        camera = replace(camera, distortion=item.camera.distortion, model=item.camera.model)
     document = {
         **result_document(result, registrar, seconds),
         "mesh": str(entry.meshes[result.mesh_index]) if entry.meshes else None,
@@ -273,34 +300,22 @@ def _registered(
             "mesh": ", ".join(map(str, entry.meshes)),
             "box": box.tolist(),
             "camera": None
-            if K is None
-            else [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
-            "camera_source": observation.camera_source,
-            "picture": observation.photo.facts(),
+            if item.camera is None
+            else [float(item.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
+            **item.facts,
         },
-        **_camera_document(result.camera, camera and camera.at(item.size)),
+        "camera": camera and camera.describe(),
+        "camera_source": camera and camera.source,
     }
     objects = [found for found in results if isinstance(found, Registration)]
     if result.detection is not None:
         document["detection"] = detection_document(objects)
     box = box.double() if result.corrected_box is None else result.corrected_box
-    files = entry.files
     return RegisteredPhotograph(
         **vars(result),
         registrar=registrar,
-        image=item.image,
-        box=box,
+        photograph=replace(item, box=box),
         document=document,
-        inputs=files,
+        inputs=entry.files,
         copies=tuple(objects[1:]),
     )
-
-
-def _camera_document(found: Camera | None, given: Camera | None) -> dict[str, Any]:
-    """The keys ``camera`` and ``camera_source``: the camera found, with the distortion of a
-    ``given`` one."""
-    if found is None:
-        found = given
-    elif given is not None:
-        found = replace(given, matrix=found.matrix, focal_deviation=found.focal_deviation)
-    return {"camera": found and found.describe(), "camera_source": found and found.source}

@@ -4,9 +4,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
+import torch
 
+from ..errors import CurviregError
 from ..registration import Registrar, Registration
+from ..registration.photograph import Photograph
+from ..utils.aliases import Document
 from ..utils.files import write_file
 from ..utils.threads import map_on_threads
 from ..visualization import pose_glb, registration_sheet
@@ -15,7 +18,6 @@ from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
 from .documents import SCHEMA
 from .store import to_json
-from .views import RigView
 
 # of the largest mesh that is written: viewers are slow with files above 30 MB
 MAX_GLB_FACES = 300_000
@@ -26,8 +28,7 @@ def write_result(
     document: dict[str, Any],
     registrar: Registrar,
     result: Registration,
-    image: Tensor,
-    box: Tensor,
+    photograph: Photograph,
     *,
     copies: Sequence[Registration] = (),
 ) -> None:
@@ -45,8 +46,8 @@ def write_result(
         out,
         document,
         len(mesh.faces),
-        lambda: png(registration_sheet(registrar, result, image, box, note=note, copies=copies)),
-        lambda: pose_glb(mesh, *result.projection, image),
+        lambda: png(registration_sheet(registrar, result, photograph, note=note, copies=copies)),
+        lambda: pose_glb(mesh, *result.projection, photograph.image),
     )
 
 
@@ -55,34 +56,45 @@ def write_views(
     document: dict[str, Any],
     registrar: Registrar,
     result: Registration,
-    views: Sequence[RigView],
+    photographs: Sequence[Photograph | CurviregError],
 ) -> None:
     """Write the files of one pose in several photographs."""
     faces = len(registrar.of_mesh(result.mesh_index).bank.mesh.faces)
-    arguments = (registrar, result, views)
+    arguments = (registrar, result, photographs, document)
     _write(out, document, faces, lambda: views_picture(*arguments), lambda: views_glb(*arguments))
 
 
-def views_picture(registrar: Registrar, result: Registration, views: Sequence[RigView]) -> bytes:
+def views_picture(
+    registrar: Registrar,
+    result: Registration,
+    photographs: Sequence[Photograph | CurviregError],
+    document: Document,
+) -> bytes:
     """``overlay.png`` of several photographs: those that could be read, with the contours at the
     pose."""
     shown = []
-    for view, pose in zip(views, result.views, strict=True):
-        if view.image is not None:
+    for row, item, pose in zip(document["photographs"], photographs, result.views, strict=True):
+        if isinstance(item, Photograph):
             score = "" if pose.edge_support is None else f"edge support {pose.edge_support:.2f}"
             box = None if pose.box is None else pose.box.tolist()
-            projection = pose.T_cam_from_model, view.camera.matrix
-            shown.append((projection, view.image, box, f"{view.name}: {pose.failure or score}"))
+            projection = pose.T_cam_from_model, item.K
+            shown.append((projection, item.image, box, f"{row['name']}: {pose.failure or score}"))
     return png(views_sheet(registrar.of_mesh(result.mesh_index).describer, shown))
 
 
-def views_glb(registrar: Registrar, result: Registration, views: Sequence[RigView]) -> bytes:
+def views_glb(
+    registrar: Registrar,
+    result: Registration,
+    photographs: Sequence[Photograph | CurviregError],
+    document: Document,
+) -> bytes:
     """``pose.glb`` of several photographs, with the cameras of those that count."""
     assert result.transform is not None
     cameras = []
-    for view, pose in zip(views, result.views, strict=True):
-        if view.image is not None and not pose.failure:
-            cameras.append((view.T_cam_from_world, view.camera.matrix, view.image))
+    for row, item, pose in zip(document["photographs"], photographs, result.views, strict=True):
+        if isinstance(item, Photograph) and not pose.failure:
+            T = torch.tensor(row["T_cam_from_world"], dtype=torch.float64)
+            cameras.append((T, item.K, item.image))
     return scene_glb(registrar.of_mesh(result.mesh_index).bank.mesh, result.transform, cameras)
 
 

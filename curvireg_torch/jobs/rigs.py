@@ -19,11 +19,13 @@ from ..errors import MAX_RIG_VIEWS, CurviregError, InvalidInputError, MissingFil
 from ..geometry import Camera
 from ..geometry.cameras import transform
 from ..registration import Registrar, Registration
+from ..registration.photograph import Photograph
 from ..utils.checks import check_pose
 from ..utils.files import FindFile, check_table_size, finite_numbers, found_in, read_csv, read_json
 from .documents import result_document
+from .entry import Entry
 from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, numbers_of
-from .views import RigView, register_views
+from .photograph import register_views
 
 ROTATION = POSE_COLUMNS[:9]
 TRANSLATION = POSE_COLUMNS[9:]
@@ -35,9 +37,7 @@ COLUMNS = (
 )
 
 
-def read_rig(
-    path: Path, mesh: Path | None = None, *, find: FindFile | None = None
-) -> list[RigView]:
+def read_rig(path: Path, mesh: Path | None = None, *, find: FindFile | None = None) -> list[Entry]:
     """Read a rig: a CSV file, a folder of COLMAP with ``images.txt`` and ``cameras.txt``, or a
     scene of a BOP set.
 
@@ -62,7 +62,7 @@ def read_rig(
     return _checked(path, _table(read_csv(path), find))
 
 
-def _checked(path: Path, rows: Iterator[RigView]) -> list[RigView]:
+def _checked(path: Path, rows: Iterator[Entry]) -> list[Entry]:
     """The rows, whose errors name the file."""
     try:
         views = list(islice(rows, MAX_RIG_VIEWS + 1))
@@ -79,7 +79,7 @@ def _checked(path: Path, rows: Iterator[RigView]) -> list[RigView]:
 
 def _view(
     name: str, photo: Path, box: Any, camera: Camera | None, rotation: Any, translation: Any
-) -> RigView:
+) -> Entry:
     """A row; ``rotation`` are 9 numbers, or 4 of a quaternion."""
     try:
         numbers = finite_numbers(rotation, 9) or finite_numbers(rotation, 4)
@@ -102,12 +102,12 @@ def _view(
         )
         T = transform(R, torch.tensor(t, dtype=torch.float64))
         check_pose(T, "the camera's pose")
-        return RigView(name, photo, box, camera, T)
+        return Entry(name=name, photo=photo, box=box, camera=camera, T_cam_from_world=T)
     except CurviregError as error:
         raise InvalidInputError(str(error), subject=name) from error
 
 
-def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[RigView]:
+def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[Entry]:
     header, *rows = cells or [[]]
     names = [name.strip().lower() for name in header]
     if twice := sorted({name for name in names if name and names.count(name) > 1}):
@@ -141,7 +141,7 @@ def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[RigView]:
         yield _view(name, find(row["photo"]), box, camera, rotation, translation)
 
 
-def _colmap(folder: Path, find: FindFile) -> Iterator[RigView]:
+def _colmap(folder: Path, find: FindFile) -> Iterator[Entry]:
     """Photographs of ``images.txt`` that lie in the folder, in ``images`` in it, or beside it."""
     check_table_size(folder / "images.txt")
     try:
@@ -191,7 +191,7 @@ def _are_points(line: str) -> bool:
     )
 
 
-def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[RigView]:
+def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[Entry]:
     """Photographs of a scene whose cameras have ``cam_R_w2c`` and ``cam_t_w2c``; lengths in mm."""
     cameras, truths, infos = (
         read_json(folder / name, dict, "datasets/bop/README.md")
@@ -236,22 +236,28 @@ def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[RigView]:
 
 
 def register_rig(
-    path: Path, rig: Sequence[RigView], registrar: Registrar, *, bank_seconds: float
-) -> tuple[Registration, dict[str, Any], list[RigView]]:
-    """Register the photographs of a rig together, see :func:`.photograph.register_views`.
-
-    Returns the registration, its document, and the photographs as they were read.
-    """
+    path: Path,
+    rig: Sequence[Entry],
+    photographs: Sequence[Photograph | CurviregError],
+    registrar: Registrar,
+    *,
+    bank_seconds: float,
+) -> tuple[Registration, dict[str, Any]]:
+    """Register the ``photographs`` of a rig together, see :meth:`.Registrar.register_views`; an
+    error is why one cannot be used. Returns the registration and its document."""
     start = time.perf_counter()
     try:
-        result, seen = register_views(rig, registrar)
+        result = register_views(rig, photographs, registrar)
     except CurviregError as error:
         raise InvalidInputError(f"{error}", subject=path) from error
     document = result_document(
         result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}
     )
     document |= {"inputs": {"rig": str(path), "box": None}}
-    for row, view in zip(document["photographs"], seen, strict=True):
-        row |= {"name": view.name, "photo": str(view.photo), "camera": view.camera.describe()}
-        row["T_cam_from_world"] = view.T_cam_from_world.tolist()
-    return result, document, seen
+    for row, view, item in zip(document["photographs"], rig, photographs, strict=True):
+        camera, T = view.in_world
+        if isinstance(item, Photograph):
+            camera = camera.at(item.size)
+        row |= {"name": view.name, "photo": str(view.photo), "camera": camera.describe()}
+        row["T_cam_from_world"] = T.tolist()
+    return result, document

@@ -24,6 +24,7 @@ from ..errors import (
 )
 from ..formats.meshes.files import mesh_digest
 from ..registration import Registrar
+from ..registration.photograph import Photograph
 from ..registration.result import verdict_of_error
 from ..registration.stages import share_of_worker
 from ..utils.executors import Workers
@@ -32,9 +33,9 @@ from ..utils.sources import package_digest
 from ..visualization.overlay import drawn_copies
 from ..visualization.sheet import thumbnail
 from .documents import SCHEMA, line_document, places_document
-from .entry import Entry, Observation, observe
+from .entry import Entry, prepare
 from .options import with_advice
-from .photograph import RegisteredPhotograph, register_observations
+from .photograph import RegisteredPhotograph, register_entries
 from .store import ResultStore, Row, has_pose
 
 NOT_IN_RESULTS = ("cli", "viewer", "visualization")
@@ -188,17 +189,17 @@ def _rows(
     for the bank, and one without a pose its share of the time."""
     start = time.perf_counter()
     prepared = [_prepared(entry, registrar) for entry in entries]
-    usable = {k: one for k, one in enumerate(prepared) if isinstance(one, Observation)}
+    usable = {k: (entries[k], one) for k, one in enumerate(prepared) if isinstance(one, Photograph)}
     answers: dict[int, RegisteredPhotograph | CurviregError] = {}
     if isinstance(registrar, Registrar) and usable:
         together = list(usable.values())
-        found = register_observations(together, registrar, bank_seconds=bank_seconds)
+        found = register_entries(together, registrar, bank_seconds=bank_seconds)
         answers = dict(zip(usable, found, strict=True))
     share = (time.perf_counter() - start) / len(entries)
     rows: list[tuple[Row, bytes | None]] = []
     for k, one in enumerate(prepared):
         seconds = {"bank": 0.0 if k else bank_seconds, "register": share}
-        if isinstance(one, Observation):
+        if isinstance(one, Photograph):
             rows.append(_row(answers[k], one, seconds))
         elif isinstance(one, CurviregError):
             rows.append((failed_row(one, seconds=seconds), None))
@@ -207,8 +208,8 @@ def _rows(
     return rows
 
 
-def _prepared(entry: Entry, registrar: Registrar | Exception) -> Observation | CurviregError | Row:
-    """What the photograph of an entry shows, why it cannot be registered, or the row of files that
+def _prepared(entry: Entry, registrar: Registrar | Exception) -> Photograph | CurviregError | Row:
+    """The photograph of an entry, why it cannot be registered, or the row of files that
     cannot be read."""
     try:
         photo = entry.read()
@@ -217,14 +218,14 @@ def _prepared(entry: Entry, registrar: Registrar | Exception) -> Observation | C
     if isinstance(registrar, Exception):
         return failed_row(registrar, skipped="unreadable_mesh")
     try:
-        return observe(entry, photo)
+        return prepare(entry, photo)
     except CurviregError as error:
         return error
 
 
 def _row(
     found: RegisteredPhotograph | CurviregError,
-    observation: Observation,
+    photograph: Photograph,
     seconds: Mapping[str, float],
 ) -> tuple[Row, bytes | None]:
     """The result of an entry, and its thumbnail; ``seconds`` are those of one without a pose."""
@@ -233,7 +234,7 @@ def _row(
         if isinstance(found, LostObjectError) and found.detection is not None:
             places = {
                 "detection": places_document(found.detection),
-                "inputs": {"picture": observation.photo.facts()},
+                "inputs": {"picture": photograph.facts["picture"]},
             }
         return failed_row(found, seconds=seconds, **places), None
     registrar = found.registrar

@@ -53,9 +53,9 @@ class Limits:
         self._frame = object_frame(bank.mesh.up, item.prior.front)
         self._centre = mesh_centre(bank.mesh)
         self._towards = torch.eye(3, dtype=torch.float64)
-        if item.camera_matrix is not None:
+        if item.camera is not None:
             centre = (item.box[:2] + item.box[2:]).double() / 2.0
-            ray = torch.linalg.solve(item.camera_matrix.double(), F.pad(centre, (0, 1), value=1.0))
+            ray = torch.linalg.solve(item.K, F.pad(centre, (0, 1), value=1.0))
             self._towards = rotation_towards(ray)
 
     def allowed(self, *, off_centre: float = 0.0) -> Tensor:
@@ -312,8 +312,7 @@ class Block(Described):
     def cameras(self) -> Tensor:
         """(P, 3, 3) float64 camera matrices, NaN where they are unknown."""
         unknown = torch.full((3, 3), torch.nan, dtype=torch.float64)
-        given = [photograph.camera_matrix for photograph in self.photographs]
-        return torch.stack([unknown if K is None else K.double() for K in given])
+        return torch.stack([unknown if one.camera is None else one.K for one in self.photographs])
 
     def with_photographs(self, changed: dict[int, Photograph]) -> "Block":
         """The block with other photographs in some places."""

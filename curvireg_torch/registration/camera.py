@@ -103,7 +103,7 @@ def best_of_fields(evidence: Tensor, count: int) -> Tensor:
 def focal_prior(item: Photograph, cameras: Tensor) -> FocalPrior:
     """What is known of the focal length of a photograph's camera; ``cameras`` (N, 3, 3) are where
     fits begin."""
-    if item.camera_source == "estimated":
+    if item.has_estimated_camera:
         return FocalPrior.usual(cameras, item.size)
     gap = (item.K[0, 0] / cameras[:, 0, 0]).log()
     reach = 4.0 * item.focal_deviation
@@ -115,7 +115,7 @@ def with_focal_length(
 ) -> Hypotheses:
     """Hypotheses of a photograph fitted at full size together with their focal lengths."""
     T = poses.T
-    if item.camera_source == "estimated":
+    if item.has_estimated_camera:
         half = ContourProblem.of(
             describer.contours, crops, poses.cameras, poses.photograph, factor=2
         )
@@ -185,7 +185,7 @@ def limits_of(target: Target, item: Photograph) -> Limits:
     """The limits of a photograph that has any; an unknown camera counts as a usual one, and widens
     them."""
     assert item.prior is not None
-    if item.camera_matrix is not None:
+    if item.camera is not None:
         return Limits(item, target.bank)
     if not target.is_exact:
         if item.prior.distance is not None:
@@ -193,14 +193,14 @@ def limits_of(target: Target, item: Photograph) -> Limits:
                 "distance: with a similar mesh, needs the camera of the photograph"
             )
         return Limits(item, target.bank)
-    usual = replace(item, camera_matrix=usual_camera(item.size))
+    usual = item.by(usual_camera(item.size))
     return Limits(usual, target.bank, off_centre=off_axis_angle(usual))
 
 
 def with_possible_cameras(target: Target, block: Block) -> tuple[Block, Hypotheses | None]:
     """Photographs whose camera is unknown with the best of several, and their starts, which have
     these; None without the contour fit, or where all cameras are known."""
-    unknown = [p for p, item in enumerate(block.photographs) if item.camera_matrix is None]
+    unknown = [p for p, item in enumerate(block.photographs) if item.camera is None]
     if not unknown:
         return block, None
     starts = (
@@ -213,12 +213,7 @@ def with_possible_cameras(target: Target, block: Block) -> tuple[Block, Hypothes
     for p in unknown:
         item = block.photographs[p]
         K = usual_camera(item.size) if starts is None else starts.cameras[starts.of(p)[0]]
-        item = replace(
-            item,
-            camera_matrix=K,
-            focal_deviation=USUAL_DEVIATION,
-            camera_source="estimated",
-        )
+        item = item.by(K, focal_deviation=USUAL_DEVIATION, source="estimated")
         changed[p] = item
         limits[p] = None if item.prior is None else Limits(item, target.bank)
         keypoints[p] = target.keypoint_matches(item, item.box) if target.uses_keypoints else None
@@ -239,7 +234,7 @@ def _starts_of_cameras(
         )
         photograph = torch.full_like(view, p)
         for camera in possible_cameras(block.photographs[p].size):
-            seen = replace(block.photographs[p], camera_matrix=camera)
+            seen = block.photographs[p].by(camera)
             parts.append(
                 poses_of_views(target, block.with_photographs({p: seen}), view, rank, photograph)
             )
@@ -327,14 +322,13 @@ def with_focal_deviation(
         if not item.focal_deviation:
             continue
         covariance, deviation = focal_covariance(target.describer, crops, poses[row], item)
-        if item.camera_source == "estimated":
+        if item.has_estimated_camera:
             centre = target.describer.centre
             covariance = covariance + principal_covariance(poses[row], item.size, centre)
         unknown = torch.full_like(poses.covariance, torch.nan).index_copy(0, row, covariance)
         is_here = (poses.photograph == p)[:, None, None]
         poses = replace(poses, covariance=torch.where(is_here, unknown, poses.covariance))
-        K = poses.cameras[int(row)]
-        changed[p] = replace(item, camera_matrix=K, focal_deviation=deviation)
+        changed[p] = item.by(poses.cameras[int(row)], focal_deviation=deviation)
     return block.with_photographs(changed), poses
 
 
@@ -376,7 +370,7 @@ def with_checked_cameras(
         [
             place
             for place, (result, item) in enumerate(zip(results, block.photographs, strict=True))
-            if result.reliable and item.camera_source != "estimated"
+            if result.reliable and not item.has_estimated_camera
         ],
         dtype=torch.long,
     )

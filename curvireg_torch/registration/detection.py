@@ -113,11 +113,11 @@ def propose(target: Target, item: Photograph) -> "Proposals":
         distance = item.prior.distance
         allowed = _allowed_views(target, item)
         # sizes do not limit an unknown camera
-        distance = None if item.camera_matrix is None else distance
+        distance = None if item.camera is None else distance
         kept = limits_of(target, item).keeps(poses)
         poses = poses[kept]
         count = count[kept]
-    focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
+    focal = None if item.camera is None else float(item.K[0, 0])
     others = target.detector(item.image, focal=focal, distance=distance, allowed=allowed)
     boxes, visible = boxes_at(target.describer.hull, poses.T, poses.cameras, item.size)
     first = boxes[visible].to(others.boxes), count[visible], poses.view[visible]
@@ -147,16 +147,14 @@ def _allowed_views(target: Target, item: Photograph) -> Tensor:
     """(N,) bool: views of the bank that the prior does not exclude everywhere in the photograph,
     which is the box."""
     off_centre = 0.0
-    if item.camera_matrix is None and target.is_exact:
-        item = replace(item, camera_matrix=usual_camera(item.size))
-    if item.camera_matrix is not None:
+    if item.camera is None and target.is_exact:
+        item = item.by(usual_camera(item.size))
+    if item.camera is not None:
         x0, y0, x1, y1 = item.box.double().tolist()
         points = torch.tensor(
             [((x0 + x1) / 2, (y0 + y1) / 2, 1), (x0, y0, 1), (x1, y0, 1), (x0, y1, 1), (x1, y1, 1)]
         )
-        rays = F.normalize(
-            torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0
-        )
+        rays = F.normalize(torch.linalg.solve(item.K, points.double().T), dim=0)
         off_centre = float(
             torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min()))
         )

@@ -185,7 +185,7 @@ def judged(
         probabilities = (*every, *[0.0] * (len(own) - len(rivals)))[: len(reported)]
         if block.exact:
             axis, of_pair = _of_groups(target, block, photograph, poses[rivals], measured)
-    with_camera = item.camera_matrix is not None
+    with_camera = item.camera is not None
     hypotheses = [
         hypothesis_of(poses, h, evidence.named(h), with_camera=with_camera) for h in reported
     ]
@@ -198,7 +198,7 @@ def judged(
         prior_contradiction=_contradiction(target, block, photograph, poses[best], gain),
         warnings=item.warnings + target.mesh_warnings + outside_warnings(fraction),
         notes=target.mesh_notes,
-        camera=item.camera,
+        camera=item.pinhole,
         axis=axis,
         pair_probability=of_pair,
         reliable_from=target.pipeline.fit.reliable,
@@ -226,7 +226,7 @@ def _of_groups(
     round_axis = target.round_axis
     axis = None
     if round_axis is not None:
-        has_camera = block.photographs[photograph].camera_matrix is not None
+        has_camera = block.photographs[photograph].camera is not None
         rotation = rivals.T[0, :3, :3] if has_camera else rivals.rotation[0]
         axis = axis_of(compared, round_axis, rotation)
     if ambiguity(rivals.rotation[:2]) not in ("half turn", "mirror"):

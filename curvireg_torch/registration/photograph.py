@@ -6,7 +6,7 @@ never reliable.
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import Any
 
@@ -23,12 +23,12 @@ from ..geometry.calibration import Camera, undistorted
 from ..geometry.crops import box_iou, check_boxes, crop_squares, square_boxes, whole_image_box
 from ..geometry.framing import clipped
 from ..geometry.pose_prior import PosePrior
+from ..utils.aliases import Fields
 from ..utils.checks import (
     are_nearly_equal,
     as_boxes,
     as_camera_matrices,
     as_numbers,
-    check_camera_matrix,
     check_finite,
     check_photograph,
     check_pixels,
@@ -67,22 +67,27 @@ MISSING_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph to register, without distortion: ``image`` (1 or 3, H, W) float or uint8,
-    ``box`` (4,), ``camera_matrix`` (3, 3), ``mask`` (H, W) float32 in [0, 1] of the object, and
-    what is questionable about them; ``focal_deviation`` and ``camera_source`` as in
-    :class:`Camera`.
+    """One photograph to register. What strangers give is checked by ``as_photograph``, once.
 
-    What strangers give is checked by ``as_photograph``, once.
+    Attributes:
+        image: (1 or 3, H, W) float or uint8, without distortion.
+        box: (4,) of the object, or the whole photograph.
+        camera: of a photograph of this size; its distortion was removed. None if it is unknown.
+        prior: limits on the pose.
+        mask: (H, W) float32 in [0, 1] of the object.
+        notes: what is questionable about them, in words.
+        has_box: whether a box or a mask tells where the object is.
+        facts: where camera and pixels are from, for the record.
     """
 
     image: Tensor
     box: Tensor
-    camera_matrix: Tensor | None
+    camera: Camera | None
     prior: PosePrior | None = None
     mask: Tensor | None = None
     notes: tuple[str, ...] = ()
-    focal_deviation: float = 0.0
-    camera_source: str = "given"
+    has_box: bool = True
+    facts: Fields = field(default_factory=dict)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -92,28 +97,37 @@ class Photograph:
     @property
     def K(self) -> Tensor:  # noqa: N802
         """(3, 3) float64 camera matrix; refuses a photograph without one."""
-        if self.camera_matrix is None:
+        if self.camera is None:
             raise InvalidInputError(
                 "needs the camera: give its matrix, or a photograph whose EXIF has its focal length"
             )
-        return self.camera_matrix.double()
+        return self.camera.matrix
 
     @property
-    def camera(self) -> Camera | None:
-        """The camera, without distortion."""
-        if self.camera_matrix is None:
-            return None
-        return Camera(
-            self.camera_matrix,
-            size=self.size,
-            focal_deviation=self.focal_deviation,
-            source=self.camera_source,
-        )
+    def pinhole(self) -> Camera | None:
+        """The camera of the pixels, without distortion."""
+        return self.camera and replace(self.camera, distortion=(), model="radial-tangential")
+
+    @property
+    def focal_deviation(self) -> float:
+        """See :class:`Camera`; 0 without one."""
+        return 0.0 if self.camera is None else self.camera.focal_deviation
+
+    @property
+    def has_estimated_camera(self) -> bool:
+        """Whether the camera is one of those that are tried where none is known."""
+        return self.camera is not None and self.camera.source == "estimated"
+
+    def by(self, matrix: Tensor, **changes: Any) -> "Photograph":
+        """The photograph by a camera of another matrix (3, 3); ``changes`` are those of further
+        attributes of :class:`Camera`."""
+        known = {"size": self.size} if self.camera is None else vars(self.camera)
+        return replace(self, camera=Camera(**{**known, **changes, "matrix": matrix}))
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What is questionable about box, camera and mask; each names the likely mistake."""
-        found = [] if self.camera_matrix is None else camera_warnings(self.camera_matrix, self.size)
+        found = [] if self.camera is None else camera_warnings(self.K, self.size)
         if (side := _visible_side(self.box, self.size)) < SMALL_BOX_SIDE:
             found.append(
                 f"the box shows {side:.0f} px on its shorter side; use a picture with at least "
@@ -325,30 +339,26 @@ def as_photograph(
                 "the mask covers most of the photograph and its border; the object must be white, "
                 "not black"
             )
-    missing = torch.zeros(pixels.shape[-2:], dtype=torch.bool)
-    deviation = 0.0
-    source = "given"
+    size = (int(pixels.shape[-2]), int(pixels.shape[-1]))
+    missing = torch.zeros(size, dtype=torch.bool)
+    has_box = box is not None or mask is not None
     if isinstance(camera, Camera):
-        camera = camera.at((pixels.shape[-2], pixels.shape[-1]))
+        camera = camera.at(size)
         pixels, box, mask, missing = undistorted(pixels, camera, box, mask)
-        deviation = camera.focal_deviation
-        source = camera.source
-        camera = camera.matrix
     if mask is not None:
         box = _box_of_mask(mask, box)
     box = whole_image_box(pixels).cpu() if box is None else box
-    check_boxes(box[None], [(int(pixels.shape[-2]), int(pixels.shape[-1]))])
+    check_boxes(box[None], [size])
     if camera is not None:
-        check_camera_matrix(camera)
-        check_square_pixels(camera)
-    item = Photograph(pixels, box, camera, prior, mask)
-    # Of an object that the border cuts, only the visible part is known.
-    item = replace(item, box=clipped(box, item.size))
+        camera = camera if isinstance(camera, Camera) else Camera(camera, size=size)
+        check_square_pixels(camera.matrix)
     if (share := float(_inside(missing, box).float().mean())) > MISSING_SHARE:
         notes.append(
             f"{100 * share:.0f} % of the box lie where the distorted photograph shows nothing"
         )
-    return replace(item, notes=tuple(notes), focal_deviation=deviation, camera_source=source)
+    # Of an object that the border cuts, only the visible part is known.
+    box = clipped(box, size)
+    return Photograph(pixels, box, camera, prior, mask, tuple(notes), has_box)
 
 
 def _object_mask(mask: Any, image: Tensor) -> Tensor:

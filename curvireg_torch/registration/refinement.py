@@ -187,7 +187,7 @@ def refine_one(
     if item.focal_deviation:
         covariance, deviation = focal_covariance(target.describer, crops, poses[best], item)
         poses = replace(poses, covariance=poses.covariance.index_copy(0, best, covariance))
-        item = replace(item, focal_deviation=deviation)
+        item = item.by(item.K, focal_deviation=deviation)
     hypotheses = tuple(hypothesis_of(poses, h, evidence.named(h)) for h in order.tolist())
     features = {name: hypotheses[0].evidence[name] for name in ("similarity", "edge_support")}
     confidence = refinement_confidence(features)
@@ -208,7 +208,7 @@ def refine_one(
         dict(features),
         warnings=item.warnings + target.mesh_warnings,
         notes=target.mesh_notes,
-        camera=item.camera,
+        camera=item.pinhole,
         reliable_from=settings.reliable,
     )
 

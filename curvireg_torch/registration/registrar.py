@@ -223,7 +223,6 @@ class Registrar(Target):
         """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
 
-    @in_full_precision
     def register_views(
         self,
         images: ImagesLike,
@@ -233,18 +232,7 @@ class Registrar(Target):
     ) -> Registration:
         """Register photographs of one object together, see
         :func:`curvireg_torch.registration.register_views`."""
-        given = images, boxes, camera_matrices, T_cam_from_world
-        meshes = (self, *self.others)
-        found: Results = []
-        for mesh in meshes:
-            try:
-                found.append(register_views(mesh, *given))
-            except CurviregError as error:
-                found.append(FailedRegistration(error))
-        result = best_of_meshes(found, meshes)
-        if isinstance(result, FailedRegistration):
-            raise result.error
-        return result
+        return register_views(self, images, boxes, camera_matrices, T_cam_from_world)
 
 
 def _matcher_of(

@@ -11,6 +11,7 @@ from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..evidence import Evidence
 from ..geometry.framing import border_sides, boxes_at, outside_fraction
 from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike
+from ..utils.precision import in_full_precision
 from .confidence import (
     MAX_MARGIN,
     RIVAL_ANGLE,
@@ -20,15 +21,9 @@ from .confidence import (
     probability_of_any,
     undetermined_axes,
 )
-from .detection import detect
-from .photograph import (
-    Photograph,
-    as_photographs,
-    check_cameras,
-    copies_of,
-    is_missing,
-    rig_cameras,
-)
+from .detection import detect_prepared
+from .judging import best_of_meshes
+from .photograph import Photograph, as_photographs, check_cameras, copies_of, rig_cameras
 from .result import FailedRegistration, PhotographPose, Registration
 from .rig import ELSEWHERE, JointPoses, Rig, RigPhotograph, RigPhotographs
 from .stages import register_photographs
@@ -86,70 +81,93 @@ def register_views(
         (torch.Size([4, 4]), 1)
     """
     check_cameras(images, camera_matrices, "register_views")
+    items = list(as_photographs(images, boxes, camera_matrices))
+    return register_prepared_views(target, items, T_cam_from_world)
+
+
+@torch.no_grad()
+@in_full_precision
+def register_prepared_views(
+    target: Target, items: Sequence[Photograph | CurviregError], T_cam_from_world: ArrayLike
+) -> Registration:
+    """:func:`register_views` with photographs that :func:`.as_photographs` has prepared, or why one
+    cannot be used."""
+    cameras = rig_cameras(T_cam_from_world, items)
+    meshes = (target, *target.others)
+    found: list[Registration | FailedRegistration] = []
+    for mesh in meshes:
+        try:
+            found.append(_registered_to(mesh, items, cameras))
+        except CurviregError as error:
+            found.append(FailedRegistration(error))
+    result = best_of_meshes(found, meshes)
+    if isinstance(result, FailedRegistration):
+        raise result.error
+    return result
+
+
+def _registered_to(
+    target: Target, items: Sequence[Photograph | CurviregError], cameras: Tensor
+) -> Registration:
+    """The joint registration to one mesh, of ``cameras`` with these poses (V, 4, 4)."""
     count = target.pipeline.hypotheses
     target = target.with_hypotheses(JOINT_HYPOTHESES)
-    items = as_photographs(images, boxes, camera_matrices)
-    cameras = rig_cameras(T_cam_from_world, items)
     copies = copies_of(cameras, items)
-    given = (
-        []
-        if boxes is None
-        else [i for i, box in enumerate(boxes) if not is_missing(box) and i not in copies]
-    )
     found: RigPhotographs = {}
-    if given:
-        found = _registered(target, items, cameras, given)
+    photographs: dict[int, Photograph] = {}
+    for i, item in enumerate(items):
+        if isinstance(item, CurviregError):
+            found[i] = item
+        elif i in copies:
+            found[i] = InvalidInputError(f"a copy of image {copies[i]}, which counts once")
+        else:
+            photographs[i] = item
+    if given := {i: item for i, item in photographs.items() if item.has_box}:
+        found |= _registered(target, given, cameras)
     else:
-        for i, (result,) in enumerate(detect(target, images, camera_matrices)):
-            if i in copies:
-                continue
-            item = items[i]
-            if isinstance(result, FailedRegistration):
-                found[i] = result.error
-            elif isinstance(item, Photograph) and result.detection is not None:
-                item = replace(item, box=result.detection.box.float())
-                found[i] = RigPhotograph.of(target, item, result, i, cameras[i])
+        detected = {i: _detected(target, item, i, cameras[i]) for i, item in photographs.items()}
         # they tell where it is in the others
-        if any(isinstance(one, RigPhotograph) for one in found.values()):
-            found = {i: one for i, one in found.items() if not isinstance(one, LostObjectError)}
-    found |= {
-        i: InvalidInputError(f"a copy of image {j}, which counts once") for i, j in copies.items()
-    }
-    if missing := [i for i in range(len(items)) if i not in found]:
+        is_found = any(isinstance(one, RigPhotograph) for one in detected.values())
+        for i, one in detected.items():
+            if not (is_found and isinstance(one, LostObjectError)):
+                found[i] = one
+    if missing := photographs.keys() - found.keys():
         where = Rig.of(target, found).answer().T[:1]
-        found |= _registered(target, items, cameras, missing, where)
+        placed = {i: _placed(target, photographs[i], cameras[i], where) for i in sorted(missing)}
+        found |= _registered(target, placed, cameras)
     return _registration(target, found, cameras, count)
 
 
-def _registered(
-    target: Target,
-    items: Sequence[Photograph | CurviregError],
-    cameras: Tensor,
-    chosen: Sequence[int],
-    T: Tensor | None = None,
-) -> RigPhotographs:
-    """Some photographs registered alone: in their boxes, or in those around a world pose ``T`` (1,
-    4, 4)."""
+def _detected(
+    target: Target, item: Photograph, index: int, camera: Tensor
+) -> RigPhotograph | CurviregError:
+    """A photograph in which the object was searched for, or why it was not found."""
+    ((result,),) = detect_prepared(target, [item])
+    if isinstance(result, FailedRegistration):
+        return result.error.with_subject("").of_image(index)
+    assert result.detection is not None
+    item = replace(item, box=result.detection.box.float())
+    return RigPhotograph.of(target, item, result, index, camera)
 
-    placed = [_placed(target, items[i], cameras[i], T) for i in chosen]
-    results = register_photographs(target, placed)
+
+def _registered(
+    target: Target, items: Mapping[int, Photograph | CurviregError], cameras: Tensor
+) -> RigPhotographs:
+    """Photographs, by their index, registered alone in their boxes."""
     found: RigPhotographs = {}
-    for i, item, result in zip(chosen, placed, results, strict=True):
-        if isinstance(item, CurviregError):
-            found[i] = item
-        elif isinstance(result, FailedRegistration):
+    results = register_photographs(target, list(items.values()))
+    for (i, item), result in zip(items.items(), results, strict=True):
+        if isinstance(result, FailedRegistration):
             found[i] = result.error.with_subject("").of_image(i)
-        else:
+        elif isinstance(item, Photograph):
             found[i] = RigPhotograph.of(target, item, result, i, cameras[i])
     return found
 
 
 def _placed(
-    target: Target, item: Photograph | CurviregError, camera: Tensor, T: Tensor | None
+    target: Target, item: Photograph, camera: Tensor, T: Tensor
 ) -> Photograph | CurviregError:
-    """A photograph with its box, or with that around a world pose ``T`` (1, 4, 4)."""
-    if T is None or isinstance(item, CurviregError):
-        return item
+    """A photograph with the box around a world pose ``T`` (1, 4, 4)."""
     try:
         box, visible = boxes_at(target.describer.hull, camera @ T, item.K, item.size)
     except CurviregError as error:

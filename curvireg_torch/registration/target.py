@@ -197,11 +197,11 @@ class Target:
 
         :meta private:
         """
-        if not self.describer.draws_colours or item.camera_matrix is None:
+        if not self.describer.draws_colours or item.camera is None:
             return None
         with _SHAPE_LOCK:  # photographs share them
             keypoints = self._keypoints
-        return keypoints.matches(item.image, item.camera_matrix, box)
+        return keypoints.matches(item.image, item.K, box)
 
     @cached_property
     def _keypoints(self) -> Keypoints:

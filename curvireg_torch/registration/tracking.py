@@ -487,7 +487,7 @@ class Follower:
         ):
             pose, K = result.projection
             with suppress(LostObjectError, ImageError):
-                self._start(replace(item, camera_matrix=K), pose, _confidence(result))
+                self._start(item.by(K), pose, _confidence(result))
                 if self._fits_camera:
                     self.camera_matrix = result.camera
         return result
@@ -545,7 +545,7 @@ class Follower:
             features,
             warnings=warnings,
             notes=notes,
-            camera=item.camera,
+            camera=item.pinhole,
             reliable_from=self._reliable,
         )
 

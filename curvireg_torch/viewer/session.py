@@ -25,22 +25,22 @@ from ..geometry import undistorted
 from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import object_frame
-from ..jobs.entry import entry_of, observe
+from ..jobs.entry import Entry, entry_of, prepare
 from ..jobs.opening import open_registrar
 from ..jobs.options import QUALIFIERS, WITHIN, RegisterOptions, check_camera
-from ..jobs.photograph import register_observation
+from ..jobs.photograph import register_entry
 from ..jobs.rigs import read_rig, register_rig
-from ..jobs.views import RigView
 from ..matching import ViewBank
 from ..mesh import Mesh, mesh_centre, mesh_radius
 from ..registration import Registrar, Registration
+from ..registration.photograph import Photograph
 from ..utils.files import only_in
 from ..visualization.pose_glb import mesh_glb
 from .programs import command_line, python_program
 from .shot import Answer, Numbers, Result, Shot, numbers
 
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
-Registered = tuple[Registration, dict[str, Any], Sequence[RigView]]
+Registered = tuple[Registration, dict[str, Any], Sequence[Photograph]]
 UNPACKED = "parts"  # the folder of what was in an archive
 
 
@@ -67,7 +67,7 @@ class Session:
     shot: Shot = field(default_factory=Shot)
     removed: tuple[int, Shot] | None = None
     rig_path: Path | None = None
-    rig: tuple[RigView, ...] = ()
+    rig: tuple[Entry, ...] = ()
     searched: tuple[Shot, ...] = ()
     mesh_path: Path | None = None
     mesh: Mesh | None = None
@@ -154,13 +154,13 @@ class Session:
             self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
 
     def _opened(
-        self, path: Path, box: Numbers | None, view: RigView | None, camera: Numbers | Camera | None
+        self, path: Path, box: Numbers | None, view: Entry | None, camera: Numbers | Camera | None
     ) -> Shot:
         """A photograph and a box, those of a ``view`` of a rig if there is one, without the
         distortion of the camera, which must fit the photograph."""
         photo = read_photo(path)
         if view is not None:
-            camera = view.camera
+            camera, _ = view.in_world
             box = box if box is not None or view.box is None else numbers(view.box)
         if not isinstance(camera, Camera):
             return Shot(path, photo, box, view)
@@ -175,9 +175,7 @@ class Session:
         notes = (*photo.notes, *["undistorted"] * camera.distorts)
         return Shot(path, replace(photo, image=image, notes=notes), box, view)
 
-    def _open_again(
-        self, shot: Shot, view: RigView | None, camera: Numbers | Camera | None
-    ) -> Shot:
+    def _open_again(self, shot: Shot, view: Entry | None, camera: Numbers | Camera | None) -> Shot:
         """A photograph with another camera, or row of a rig. Its box stays unless distortion is
         removed, or no longer is; its result only where no rig is concerned."""
         opened = self._opened(shot.path, None, view, camera)
@@ -215,13 +213,13 @@ class Session:
                 raise MissingFileError("no such file; drop it here", subject=subject) from error
             raise error.with_subject(subject) from error
 
-    def _read_rig(self, path: Path) -> tuple[RigView, ...]:
+    def _read_rig(self, path: Path) -> tuple[Entry, ...]:
         """The rows of a rig. It comes from anyone who has the address: it names files beside it
         only."""
         rig = tuple(
             read_rig(path, self.mesh_path, find=only_in(path if path.is_dir() else path.parent))
         )
-        rows = dict[str, RigView]()
+        rows = dict[str, Entry]()
         for view in rig:
             same = rows.setdefault(_key(view.photo), view)
             if same is not view:
@@ -243,7 +241,7 @@ class Session:
             )
         self._replace_shots(shots)
 
-    def _row_of(self, path: Path, shots: Sequence[Shot]) -> RigView | None:
+    def _row_of(self, path: Path, shots: Sequence[Shot]) -> Entry | None:
         """The row of the rig with the file name of a photograph, if none of ``shots`` has it."""
         taken = [_key(shot.path) for shot in shots if shot.view is not None]
         rows = [
@@ -458,38 +456,28 @@ class Session:
     def _register_alone(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
     ) -> tuple[Registered, list[Tensor | None]]:
-        ((shot,), camera) = shots, self.options.camera
-        assert shot.photo is not None
+        (shot,) = shots
         entry = entry_of(request.photos[0], request)
         meshes = tuple(Path(self.name(path)) for path in entry.meshes)
         entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
-        observation = observe(entry, shot.photo)
-        found = register_observation(observation, registrar, bank_seconds=seconds)
-        if isinstance(camera, Camera):
-            found.document["camera"] = camera.at(shot.size).describe()
-            found.document["inputs"]["camera_source"] = "file"
+        photograph = _prepared(entry, shot, self.options.camera)
+        found = register_entry(entry, photograph, registrar, bank_seconds=seconds)
         return (found, found.document, ()), [found.box.float()]
 
     def _register_rig(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
     ) -> tuple[Registered, list[Tensor | None]]:
         views = []
+        photographs = []
         for shot in shots:
             assert shot.view is not None
-            assert shot.photo is not None
-            camera = Camera(shot.view.camera.at(shot.size).matrix, size=shot.size)
-            views.append(
-                replace(
-                    shot.view, photo=shot.path, box=shot.box, camera=camera, image=shot.photo.image
-                )
-            )
-        registration, document, photographs = register_rig(
-            Path(self.rig_name), views, registrar, bank_seconds=seconds
+            view = replace(shot.view, photo=Path(self.name(shot.path)), box=shot.box)
+            views.append(view)
+            photographs.append(_prepared(view, shot, view.camera))
+        registration, document = register_rig(
+            Path(self.rig_name), views, photographs, registrar, bank_seconds=seconds
         )
         document["mesh"] = self.name(request.meshes[0])
-        for row, shot in zip(document["photographs"], shots, strict=True):
-            row["photo"] = self.name(row["photo"])
-            row["camera"] = shot.view.camera.at(shot.size).describe() if shot.view else None
         boxes = [view.box for view in registration.views]
         return (registration, document, photographs), boxes
 
@@ -538,6 +526,17 @@ class Session:
             if self._registrar is None or self._registrar[0] != key:
                 self._registrar = key, open_registrar(key, key.meshes, progress=report)
             return self._registrar[1]
+
+
+def _prepared(entry: Entry, shot: Shot, camera: object) -> Photograph:
+    """The photograph of an entry as it is shown: that of a calibrated ``camera`` has lost its
+    distortion already."""
+    if not isinstance(camera, Camera):
+        return prepare(entry, shot.photo)
+    camera = camera.at(shot.size)
+    pinhole = Camera(camera.matrix, size=shot.size)
+    photograph = prepare(replace(entry, camera=pinhole), shot.photo)
+    return replace(photograph, camera=camera)
 
 
 def registrar_key(request: RegisterOptions) -> RegisterOptions:

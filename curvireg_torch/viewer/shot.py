@@ -14,10 +14,11 @@ from ..data.images import Photo
 from ..errors import InvalidInputError
 from ..geometry import rotation_error, rotation_from_axis_angle
 from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
+from ..jobs.entry import Entry
 from ..jobs.options import RegisterOptions
 from ..jobs.result_files import views_glb, views_picture
-from ..jobs.views import RigView
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
+from ..registration.photograph import Photograph
 from ..utils.likes import BoxLike
 from ..visualization import contour_overlay, pose_glb
 from ..visualization.encoding import png
@@ -50,7 +51,7 @@ class Result:
     registrar: Registrar
     registration: Registration
     document: dict[str, Any]  # the content of result.json, if the first answer is chosen
-    photographs: Sequence[RigView]  # of a rig
+    photographs: Sequence[Photograph]  # of a rig
     inputs: tuple[RegisterOptions, tuple[Numbers | None, ...]]  # what was asked for, in which boxes
     answer: Answer
     answer_before: Answer | None = None
@@ -144,7 +145,7 @@ class Shot:
     path: Path = Path()
     photo: Photo | None = None
     box: Numbers | None = None
-    view: RigView | None = None
+    view: Entry | None = None
     box_before: Numbers | None = None
     result: Result | None = None
     found_box: Tensor | None = None
@@ -183,7 +184,8 @@ class Shot:
         """Like :attr:`projection` of any pose of the result."""
         if self.view is None or pose.transform is None:
             return pose.projection
-        return self.view.T_cam_from_world @ pose.transform, self.view.camera.at(self.size).matrix
+        camera, T = self.view.in_world
+        return T @ pose.transform, camera.at(self.size).matrix
 
     def set_box(self, box: Numbers | None) -> None:
         """Replace the box."""
@@ -215,7 +217,7 @@ class Shot:
         )
         allocentric = rotation_towards(centre).mT @ T[:3, :3]
         has_translation = answer.pose.translation is not None
-        placed = T if self.view is None else torch.linalg.inv(self.view.T_cam_from_world) @ T
+        placed = T if self.view is None else torch.linalg.inv(self.view.in_world[1]) @ T
         pose = replace(
             answer.pose,
             rotation=placed[:3, :3].clone() if has_translation else allocentric,
@@ -261,7 +263,7 @@ class Shot:
         result = self.require_result()
         assert self.photo is not None
         if result.photographs:
-            return views_glb(result.registrar, result.chosen, result.photographs)
+            return views_glb(result.registrar, result.chosen, result.photographs, result.document)
         return pose_glb(
             result.registrar.bank.mesh, *result.answer.pose.projection, self.photo.image
         )
@@ -271,7 +273,9 @@ class Shot:
         result = self.require_result()
         assert self.photo is not None
         if result.photographs:
-            return views_picture(result.registrar, result.chosen, result.photographs)
+            return views_picture(
+                result.registrar, result.chosen, result.photographs, result.document
+            )
         return png(
             contour_overlay(
                 result.registrar, result.answer.pose, self.photo.image, self.require_box()

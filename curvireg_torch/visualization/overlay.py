@@ -3,6 +3,7 @@ was found."""
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from ..geometry import rotation_error
+from ..geometry.framing import clipped
 from ..matching import ViewDescriber
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.confidence import two_decimals
@@ -44,8 +46,8 @@ LEGEND = "Green: outline of the mesh at this pose. Orange: its inner edges. Whit
 def contour_overlay(
     registrar: Registrar,
     result: Registration | Hypothesis,
-    image: ImageLike,
-    box: BoxLike,
+    image: ImageLike | Photograph,
+    box: BoxLike | None = None,
     *,
     copies: Sequence[Registration] = (),
 ) -> np.ndarray:
@@ -56,7 +58,7 @@ def contour_overlay(
         registrar, result: the result of this registrar, or one of its hypotheses; it is drawn with
             its ``projection``.
         image, box: the photograph, as the registrar takes it: a (1 or 3, H, W) tensor, an array or
-            a path; (4,) px.
+            a path; (4,) px. A prepared :class:`.Photograph` has its box.
         copies: further objects that :func:`.detect` found in it; they are drawn too.
 
     Returns:
@@ -72,7 +74,7 @@ def contour_overlay(
         >>> contour_overlay(registrar, result, scene.image, scene.box).shape
         (720, 960, 3)
     """
-    item = as_photograph(image, as_numbers(box, "box"))
+    item = _shown(image, box)
     H, W = item.size
     describer = registrar.of_mesh(getattr(result, "mesh_index", 0)).describer
     more = drawn_copies(registrar, copies)
@@ -82,6 +84,13 @@ def contour_overlay(
     return draw_window(
         describer, result.projection, item.image, whole, 1.0, box_sides, more, axis=axis
     )
+
+
+def _shown(image: ImageLike | Photograph, box: BoxLike | None) -> Photograph:
+    """The photograph that is drawn, with the part of the box that it shows."""
+    if isinstance(image, Photograph):
+        return replace(image, box=clipped(image.box.float(), image.size))
+    return as_photograph(image, None if box is None else as_numbers(box, "box"))
 
 
 def _axis_ends(registrar: Registrar, result: Registration) -> Tensor | None:
@@ -148,7 +157,10 @@ def _paste_tiles(
 
 @torch.no_grad()
 def side_pictures(
-    registrar: Registrar, result: Registration | Hypothesis, image: ImageLike, box: BoxLike
+    registrar: Registrar,
+    result: Registration | Hypothesis,
+    image: ImageLike | Photograph,
+    box: BoxLike | None = None,
 ) -> dict[str, np.ndarray]:
     """(S, S, 3) uint8 RGB of "photograph", "photograph field", "pose", "view field"; see
     :func:`contour_overlay`.
@@ -163,7 +175,7 @@ def side_pictures(
         >>> sorted(side_pictures(registrar, result, scene.image, scene.box))
         ['photograph', 'photograph field', 'pose', 'view field']
     """
-    item = as_photograph(image, as_numbers(box, "box"))
+    item = _shown(image, box)
     settings = registrar.bank.settings
     crop = crop_photographs(
         [item.image], item.box[None], size=settings.image_size, margin=settings.margin
@@ -189,8 +201,8 @@ def _field_picture(field: Tensor) -> np.ndarray:
 def registration_sheet(
     registrar: Registrar,
     result: Registration,
-    image: ImageLike,
-    box: BoxLike,
+    image: ImageLike | Photograph,
+    box: BoxLike | None = None,
     *,
     note: str = "",
     copies: Sequence[Registration] = (),
@@ -214,7 +226,7 @@ def registration_sheet(
         >>> registration_sheet(registrar, result, scene.image, scene.box).shape[1]
         960
     """
-    item = as_photograph(image, as_numbers(box, "box"))
+    item = _shown(image, box)
     more = drawn_copies(registrar, copies)
     axis = _axis_ends(registrar, result)
     if axis is not None:
@@ -300,7 +312,7 @@ def _small_pictures(
     close_ups = [
         draw_window(describer, h.projection, item.image, window, scale) for h in result.hypotheses
     ]
-    sides = side_pictures(registrar, result, item.image, item.box)
+    sides = side_pictures(registrar, result, item)
     names = "photograph field", "view field", "pose"
     captions = "edges of the photograph", "edges of the mesh", "mesh at this pose"
     found = [cv2.resize(sides[name], (side, side), interpolation=cv2.INTER_CUBIC) for name in names]

@@ -6,6 +6,7 @@ from typing import Any
 from ..errors import MissingDependencyError
 from ..matching import ViewBank
 from ..registration import Hypothesis, Registrar, Registration
+from ..registration.photograph import Photograph
 from ..utils.extras import install_command
 from ..utils.likes import BoxLike, ImageLike
 from .overlay import side_pictures
@@ -36,7 +37,10 @@ def viewpoints(bank: ViewBank, result: Registration) -> Any:
 
 
 def fields(
-    registrar: Registrar, result: Registration | Hypothesis, image: ImageLike, box: BoxLike
+    registrar: Registrar,
+    result: Registration | Hypothesis,
+    image: ImageLike | Photograph,
+    box: BoxLike | None = None,
 ) -> Any:
     """The photograph and its field, the pose and its field; arguments as for
     :func:`.contour_overlay`."""

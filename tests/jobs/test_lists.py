@@ -15,7 +15,7 @@ from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.formats.poses import PoseRecord
 from curvireg_torch.jobs import lists, photograph, runner
-from curvireg_torch.jobs.entry import Entry, camera_of, observe, start_in_unit
+from curvireg_torch.jobs.entry import Entry, camera_of, prepare, start_in_unit
 from curvireg_torch.jobs.lists import find_photographs, list_photographs, read_list
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.pipeline import PRESETS
@@ -68,11 +68,11 @@ def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, 
     ]
     done = []
 
-    def observe_in_box(one, photo):
+    def prepare_in_box(one, photo):
         done.append(one)
-        return observe(replace(one, box=entry.box, instances=1), photo)
+        return prepare(replace(one, box=entry.box, instances=1), photo)
 
-    monkeypatch.setattr(runner, "observe", observe_in_box)
+    monkeypatch.setattr(runner, "prepare", prepare_in_box)
     for settings in ({"hypotheses": 1}, {"hypotheses": 2}):
         done.clear()
         for _ in range(2):

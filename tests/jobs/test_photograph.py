@@ -14,7 +14,7 @@ import curvireg_torch as cr
 from curvireg_torch.cli import main
 from curvireg_torch.data import Photo
 from curvireg_torch.jobs import photograph
-from curvireg_torch.jobs.entry import Entry, observe
+from curvireg_torch.jobs.entry import Entry, prepare
 from curvireg_torch.jobs.outputs import MARKER
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, write_files
@@ -141,7 +141,7 @@ def test_every_copy_is_drawn_and_saved(tmp_path, monkeypatch):
     monkeypatch.setattr(photograph, "detect_prepared", lambda *_, **__: [found])
     entry = Entry(name="two.png", photo=tmp_path / "two.png", meshes=(), instances=2)
     picture = Photo((255 * image).round().byte(), 1, None, ())
-    result = photograph.register_observation(observe(entry, picture), registrar)
+    result = photograph.register_entry(entry, prepare(entry, picture), registrar)
     assert [copy.detection.box.tolist() for copy in result.copies] == [boxes[1].tolist()]
     instances = result.document["detection"]["instances"]
     assert [one["verdict"] for one in instances] == [one.verdict for one in found]

@@ -15,7 +15,6 @@ from curvireg_torch.formats.poses import PoseRecord
 from curvireg_torch.jobs import runner
 from curvireg_torch.jobs.entry import Entry
 from curvireg_torch.jobs.runner import run_entries
-from curvireg_torch.jobs.views import RigView
 from curvireg_torch.utils import sources
 from curvireg_torch.utils.executors import Workers
 from curvireg_torch.utils.files import write_file
@@ -208,14 +207,14 @@ def test_a_photograph_that_ends_its_worker_fails_and_is_tried_again(entries, tmp
 
 def test_the_first_of_a_block_pays_for_the_bank(monkeypatch):
     monkeypatch.setattr(Entry, "read", Mock())
-    monkeypatch.setattr(runner, "observe", Mock(side_effect=InvalidInputError("an empty box")))
+    monkeypatch.setattr(runner, "prepare", Mock(side_effect=InvalidInputError("an empty box")))
     rows = runner._rows([Entry(), Entry()], Mock(), bank_seconds=2.0)
     assert [row["seconds"]["bank"] for row, _ in rows] == [2.0, 0.0]
 
 
 def test_a_missing_photograph_beside_others_is_tried_again(entries, tmp_path):
     """Of several photographs of one pose."""
-    gone = RigView("gone.png", tmp_path / "gone.png", None, CAMERA, torch.eye(4))
+    gone = Entry(photo=tmp_path / "gone.png", camera=CAMERA, T_cam_from_world=torch.eye(4))
     rig = [replace(entries[0], views=(gone,)), replace(entries[2], views=(gone,))]
     assert registered(rig, tmp_path / "out") == ["0a", "1a"]
     assert registered(rig, tmp_path / "out") == ["0a", "1a"]
@@ -228,7 +227,7 @@ CAMERA = Camera(torch.eye(3))
 ENTRY = Entry(
     {"note": "x"}, "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=CAMERA
 )
-VIEWS = (RigView("z.png", Path("z.png"), None, CAMERA, torch.eye(4)),)
+VIEWS = (Entry(name="z.png", photo=Path("z.png"), camera=CAMERA, T_cam_from_world=torch.eye(4)),)
 OTHERS = {
     "name": "y.png",
     "instances": 2,

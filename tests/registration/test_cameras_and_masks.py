@@ -186,9 +186,7 @@ def test_camera_is_scaled_to_each_photograph():
         RADIAL,
     )
     point = torch.tensor([[0.4, 0.2, 1.0]]).double()
-    large, small = (
-        project_points(point, torch.eye(4).double(), items[i].camera_matrix) for i in (0, 1)
-    )
+    large, small = (project_points(point, torch.eye(4).double(), items[i].K) for i in (0, 1))
     torch.testing.assert_close((large + 0.5) / 2 - 0.5, small)
     torch.testing.assert_close((items[0].box + 0.5) / 2 - 0.5, items[1].box, atol=0.02, rtol=0)
     (error,) = as_photographs([photo[:, :90]], None, RADIAL)

@@ -270,11 +270,11 @@ def test_allowed_views_are_those_of_any_place_in_the_photograph(registrar):
     """Half of the diagonal is 30 degrees wide; 7.5 more are the spacing of views."""
     image = scene(0)[0]
     prior = PosePrior(rotation=bank().rotations[0], within=1.0)
-    item = Photograph(image, torch.tensor([-0.5, -0.5, 239.5, 179.5]), CAMERA, prior)
+    item = Photograph(image, torch.tensor([-0.5, -0.5, 239.5, 179.5]), cr.Camera(CAMERA), prior)
     degrees = rotation_error(bank().rotations, bank().rotations[0])
     half = math.degrees(math.atan(150 / 260))
     assert torch.equal(_allowed_views(registrar, item), degrees <= 8.5 + half)
-    unknown = replace(item, camera_matrix=None)
+    unknown = replace(item, camera=None)
     assert torch.equal(
         _allowed_views(cr.Registrar(bank(), mesh_is="similar"), unknown), degrees <= 8.5
     )

@@ -9,7 +9,7 @@ import torch
 from curvireg_torch import camera_matrix
 from curvireg_torch.fitting import focal_length
 from curvireg_torch.fitting.edges import EdgeCrops
-from curvireg_torch.geometry import axis_angle_from_rotation, rotation_error
+from curvireg_torch.geometry import Camera, axis_angle_from_rotation, rotation_error
 from curvireg_torch.geometry.cameras import point_in_cameras, rotation_towards
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.hypotheses import Hypotheses, projected_box
@@ -29,7 +29,7 @@ def test_covariance_and_deviation_of_the_focal_length():
         T[None], NEAR[None], describer.centre, one, torch.zeros(1, dtype=torch.float64)
     )
     poses = replace(poses, covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
-    item = replace(as_photograph(image, box, NEAR), focal_deviation=0.05, camera_source="exif")
+    item = as_photograph(image, box, Camera(NEAR, focal_deviation=0.05, source="exif"))
     covariance, deviation = camera_module.focal_covariance(describer, crops, poses, item)
     assert 0.0 < deviation < 0.05, "the prior and the photograph together"
     z = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
@@ -106,13 +106,11 @@ def test_priors_by_source():
     image, box, _ = near_scene()
     item = as_photograph(image, box, NEAR)
     cameras = focal_length.scaled_cameras(NEAR[None], torch.tensor([0.1]).double())
-    exif = camera_module.focal_prior(
-        replace(item, focal_deviation=0.05, camera_source="exif"), cameras
-    )
+    exif = camera_module.focal_prior(item.by(NEAR, focal_deviation=0.05, source="exif"), cameras)
     assert float(exif.log_zoom) == pytest.approx(-0.1)
     assert (float(exif.low), float(exif.high)) == (pytest.approx(-0.3), pytest.approx(0.1))
     assert (exif.deviation, exif.reach) == (0.05, float("inf"))
-    usual = camera_module.focal_prior(replace(item, camera_source="estimated"), NEAR[None])
+    usual = camera_module.focal_prior(item.by(NEAR, source="estimated"), NEAR[None])
     assert float(usual.log_zoom.exp()) == pytest.approx(
         focal_length.USUAL_FOCAL * max(SIZE) / 150.0
     )

@@ -55,11 +55,11 @@ def judgement(
     item = SimpleNamespace(
         box=BOX,
         size=SIZE,
-        camera_matrix=CAMERA,
         focal_deviation=0.0,
         prior=None,
         warnings=("of the photograph",),
-        camera=None,
+        camera=CAMERA,
+        pinhole=None,
     )
     ranking = Ranking(torch.tensor([scores or [1.0, 0.5, 0.25]]), torch.arange(3)[None], {})
     limits = changes.pop("limits", None)

@@ -9,6 +9,7 @@ import torch
 from curvireg_torch import camera_matrix
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import (
+    Camera,
     rotation_error,
     rotation_from_axis_angle,
     rotation_towards,
@@ -54,7 +55,7 @@ def test_each_photograph_has_its_own_prior_which_may_leave_no_view():
 
 
 def limits_of(prior, box=(100.0, 60.0, 140.0, 100.0)):
-    item = Photograph(torch.rand(3, 180, 240), torch.tensor(box), CAMERA, prior)
+    item = Photograph(torch.rand(3, 180, 240), torch.tensor(box), Camera(CAMERA), prior)
     return Limits(item, truck_bank())
 
 

@@ -20,13 +20,19 @@ from curvireg_torch import (
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
 from curvireg_torch.evidence import Evidence
 from curvireg_torch.fitting import contour_fit
-from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
+from curvireg_torch.geometry import Camera, box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS, FitSettings
-from curvireg_torch.registration import FailedRegistration, Follower, block, hypotheses, stages
+from curvireg_torch.registration import (
+    FailedRegistration,
+    Follower,
+    block,
+    hypotheses,
+    several,
+    stages,
+)
 from curvireg_torch.registration import block as described_module
-from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration.photograph import Photograph, check_crop
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
@@ -141,7 +147,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
     """Without it, only views beyond 50 degrees are too far: from one 21 degrees off the true pose,
     which is 30 degrees from the best view, the fit ends 0.8 degrees off all the same."""
     registrar = truck_registrar(fit=FitSettings(screening_weight=weight))
-    item = Photograph(IMAGE, BOX, CAMERA)
+    item = Photograph(IMAGE, BOX, Camera(CAMERA))
     query = registrar.matcher.query([IMAGE], BOX[None])
     ranking = registrar.matcher.rank(query)
     bank = registrar.bank
@@ -443,7 +449,7 @@ def test_boxes_are_compared_inside_the_photograph():
         # outside: not used
         ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),
     ):
-        item = Photograph(torch.zeros(3, *size), torch.tensor(given), CAMERA)
+        item = Photograph(torch.zeros(3, *size), torch.tensor(given), Camera(CAMERA))
         assert item.shows_other_part(torch.tensor(box, dtype=torch.float64)) == expected
 
 
@@ -459,13 +465,13 @@ def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
             raise LostObjectError("first" if registrar is both else "second")
         return found
 
-    monkeypatch.setattr(registrar_module, "register_views", register)
-    assert both.register_views([IMAGE], None, CAMERA, None).mesh_index == 1
+    monkeypatch.setattr(several, "_registered_to", register)
+    assert both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None]).mesh_index == 1
     absent.add(both.others[0])
     with pytest.raises(LostObjectError, match="first"):
-        both.register_views([IMAGE], None, CAMERA, None)
+        both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None])
     absent.remove(both)
-    assert both.register_views([IMAGE], None, CAMERA, None).mesh_index == 0
+    assert both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None]).mesh_index == 0
 
 
 def test_a_registrar_that_was_used_can_be_pickled_and_copied():

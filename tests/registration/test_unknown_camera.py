@@ -15,7 +15,7 @@ from curvireg_torch.fitting.focal_length import (
     scaled_cameras,
 )
 from curvireg_torch.fitting.least_squares import apply_twist
-from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.geometry import Camera, rotation_from_viewpoint, transform
 from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import camera as camera_module
@@ -55,7 +55,7 @@ def test_cameras_that_are_tried_have_all_fields_of_view():
 def test_the_angle_to_the_centre_of_the_box():
     K = CAMERA.clone()
     box = torch.tensor([119.5 + 100, 89.5 - 20, 119.5 + 160, 89.5 + 20])
-    item = Photograph(torch.zeros(3, *SIZE), box, K)
+    item = Photograph(torch.zeros(3, *SIZE), box, Camera(K))
     assert camera_module.off_axis_angle(item) == pytest.approx(
         math.degrees(math.atan(130.0 / 260.0))
     )
@@ -95,8 +95,8 @@ def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source
     monkeypatch.setattr(camera_module, "fit_focal_length", fit)
     monkeypatch.setattr(camera_module, "measured_fit", measured)
     describer = SimpleNamespace(contours=None, centre=CENTRE)
-    item = Photograph(torch.zeros(3, *SIZE), BOX, CAMERA)
-    item = replace(item, camera_source=source, focal_deviation=0.1)
+    camera = Camera(CAMERA, focal_deviation=0.1, source=source)
+    item = Photograph(torch.zeros(3, *SIZE), BOX, camera)
     found = camera_module.with_focal_length(describer, NOTHING, poses, item)
     assert fitted == factors
     zoom = float(found.cameras[0, 0, 0] / CAMERA[0, 0])
@@ -114,8 +114,7 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
     monkeypatch.setattr(camera_module.ContourProblem, "of", lambda *_: problem)
     monkeypatch.setattr(camera_module, "focal_information", lambda *_: (information, motion))
     describer = SimpleNamespace(contours=None, centre=CENTRE)
-    item = Photograph(torch.zeros(3, *SIZE), BOX, CAMERA)
-    item = replace(item, focal_deviation=0.2)
+    item = Photograph(torch.zeros(3, *SIZE), BOX, Camera(CAMERA, focal_deviation=0.2))
     covariance, deviation = camera_module.focal_covariance(describer, NOTHING, pose, item)
     measured = camera_module.REPORTED_VARIANCE * 0.04
     variance = 1.0 / (1.0 / measured + 1.0 / 0.2**2)
@@ -209,7 +208,7 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
     best = torch.full((1, 6, 6), 2.0, dtype=torch.float64)
     monkeypatch.setattr(camera_module, "focal_covariance", lambda *_: (best, 0.07))
     target = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), describer=None)
-    item = replace(Photograph(torch.zeros(3, *SIZE), BOX, CAMERA), focal_deviation=0.1)
+    item = Photograph(torch.zeros(3, *SIZE), BOX, Camera(CAMERA, focal_deviation=0.1))
     given = {field.name: None for field in fields(Block)}
     block = Block(**given | {"photographs": [item]})
     outside = torch.tensor([False, False, True])
@@ -217,7 +216,7 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
     block, after = camera_module.with_focal_deviation(target, block, NOTHING, before)
     (photograph,) = block.photographs
     assert photograph.focal_deviation == 0.07
-    assert torch.equal(photograph.camera_matrix, poses.cameras[1])
+    assert torch.equal(photograph.K, poses.cameras[1])
     assert after.covariance[[0, 2]].isnan().all()
     assert torch.equal(after.covariance[1], best[0])
 
@@ -226,13 +225,13 @@ def test_limits_of_an_unknown_camera_are_wider_by_how_far_the_box_is_off_the_axi
     made = []
 
     def limits(item, _, off_centre=0.0):
-        made.append((item.camera_matrix, off_centre))
+        made.append((item.camera and item.K, off_centre))
         return "limits"
 
     monkeypatch.setattr(camera_module, "Limits", limits)
     prior = SimpleNamespace(distance=None)
-    known = Photograph(torch.zeros(3, *SIZE), BOX, CAMERA, prior)
-    unknown = replace(known, camera_matrix=None)
+    known = Photograph(torch.zeros(3, *SIZE), BOX, Camera(CAMERA), prior)
+    unknown = replace(known, camera=None)
     target = SimpleNamespace(bank=None, is_exact=True)
     similar = SimpleNamespace(bank=None, is_exact=False)
     for one, item in ((target, known), (target, unknown), (similar, unknown)):
@@ -241,7 +240,7 @@ def test_limits_of_an_unknown_camera_are_wider_by_how_far_the_box_is_off_the_axi
     assert torch.equal(first, CAMERA)
     assert (none, also_none, last) == (0.0, 0.0, None)
     assert torch.equal(usual, camera_module.usual_camera(SIZE))
-    assert off == pytest.approx(camera_module.off_axis_angle(replace(known, camera_matrix=usual)))
+    assert off == pytest.approx(camera_module.off_axis_angle(known.by(usual)))
     with_distance = SimpleNamespace(distance=(1.0, 2.0))
     with pytest.raises(InvalidInputError, match="distance"):
         camera_module.limits_of(similar, replace(unknown, prior=with_distance))
