@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
-from typing import NamedTuple
 
 from torch import Tensor
 
@@ -77,14 +76,3 @@ class FrameReader:
 @lru_cache(MAX_SHARED)
 def _shared_reader(path: Path, every: int) -> FrameReader:
     return FrameReader(path, every=every)
-
-
-class VideoFrame(NamedTuple):
-    """One frame of a video."""
-
-    video: FrameReader
-    number: int
-
-    def read(self) -> Tensor:
-        """Its pixels, see :meth:`FrameReader.read`."""
-        return self.video.read(self.number)

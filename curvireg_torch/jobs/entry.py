@@ -1,6 +1,6 @@
 """One photograph with what is known about it, before it is registered."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -9,7 +9,6 @@ from typing import Any
 from torch import Tensor
 
 from ..data import Photo, read_photo
-from ..data.frames import VideoFrame
 from ..errors import CurviregError, InvalidInputError, MissingFileError
 from ..formats.boxes import PictureSize
 from ..formats.masks import mask_as_shown, mask_file
@@ -49,7 +48,7 @@ class Entry:
     # boxes refer to the pixels in the file; else the EXIF orientation is applied first
     as_stored: bool = False
     label: str = ""  # of a dataset's object: a name that no other object has
-    frame: VideoFrame | None = None  # of the video ``photo``
+    read_frame: Callable[[], Tensor] | None = None  # of the video ``photo``
     error: str = ""  # why the object cannot be registered
 
     def request(self) -> list[Any]:
@@ -75,8 +74,8 @@ class Entry:
 
     def read(self) -> Photo:
         """The photograph, or the frame; errors are those of :func:`read_photo`."""
-        if self.frame is not None:
-            return Photo(self.frame.read())
+        if self.read_frame is not None:
+            return Photo(self.read_frame())
         return read_photo(self.photo, as_stored=self.as_stored)
 
     @property

@@ -7,13 +7,14 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from ..data import Video
 from ..data.cameras import Calibrations
-from ..data.frames import FrameReader, VideoFrame
+from ..data.frames import FrameReader
 from ..errors import (
     MAX_LIST_COLUMNS,
     CurviregError,
@@ -148,10 +149,10 @@ def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]
     for path in options.photos:
         if is_video(path):
             common = entry_of(path, options)
-            entries += [
-                replace(common, name=name, frame=frame)
-                for name, frame in _video_frames(path, every)
-            ]
+            reader = FrameReader(path, every=every)
+            for number in Video(path, every=every).numbers():
+                name = f"{path}:{number:06d}"
+                entries.append(replace(common, name=name, read_frame=partial(reader.read, number)))
         else:
             entries += [_entry_of(photo, options) for photo in find_photographs(path)]
     return [replace(entry, cells={"photo": entry.name, **numbers}) for entry in entries]
@@ -170,13 +171,6 @@ def _entry_of(photo: Path, options: RegisterOptions) -> Entry:
 def is_video(path: Path) -> bool:
     """Whether a path is that of a video file."""
     return path.suffix.lower() in VIDEOS and path.is_file()
-
-
-def _video_frames(path: Path, every: int) -> Iterator[tuple[str, VideoFrame]]:
-    """Name of ``every`` n-th frame of a video, and the frame, which is read later."""
-    reader = FrameReader(path, every=every)
-    for number in Video(path, every=every).numbers():
-        yield f"{path}:{number:06d}", VideoFrame(reader, number)
 
 
 def find_photographs(path: Path) -> list[Path]:

@@ -50,7 +50,6 @@ def output_folder(
     *,
     inputs: Iterable[Path] = (),
     source: Sequence[str] = (),
-    more: Sequence[str] = (),
 ) -> Iterator[None]:
     """Context in which ``command`` may write its files into ``folder``, which is created, and goes
     again if nothing was written.
@@ -61,14 +60,13 @@ def output_folder(
         inputs: files that the command reads.
         source: what the results are of, for results that several runs share: a later run must name
             all of it again, since it keeps no other rows.
-        more: names of further files.
 
     Raises:
         InvalidInputError: a file in the way that is an input, or that this command did not write;
             results of another source; or another run that writes here.
         OutputError: the folder cannot be written to.
     """
-    names = (*FILES[command], *more)
+    names = FILES[command]
     in_the_way = _existing(folder, names)
     _check_inputs(in_the_way, inputs)
     written = _read(folder)

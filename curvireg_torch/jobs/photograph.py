@@ -25,7 +25,8 @@ from ..registration.detection import detect_prepared
 from ..registration.hypotheses import projected_box
 from ..registration.photograph import Photograph, as_photograph
 from ..registration.refinement import refine_prepared
-from ..registration.registrar import ObjectLike, Results
+from ..registration.registrar import ObjectLike
+from ..registration.result import Results
 from ..registration.several import register_prepared_views
 from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike
 from ..visualization import contour_overlay, plots

@@ -188,61 +188,47 @@ def _rows(
     """The results of entries, which are registered together, and their thumbnails; the first pays
     for the bank, and one without a pose its share of the time."""
     start = time.perf_counter()
-    prepared = [_prepared(entry, registrar) for entry in entries]
-    usable = {k: (entries[k], one) for k, one in enumerate(prepared) if isinstance(one, Photograph)}
-    answers: dict[int, RegisteredPhotograph | CurviregError] = {}
-    if isinstance(registrar, Registrar) and usable:
-        together = list(usable.values())
-        found = register_entries(together, registrar, bank_seconds=bank_seconds)
-        answers = dict(zip(usable, found, strict=True))
+    rows: dict[int, tuple[Row, bytes | None]] = {}
+    prepared: dict[int, tuple[Entry, Photograph]] = {}
+    found: dict[int, RegisteredPhotograph | CurviregError] = {}
+    for k, entry in enumerate(entries):
+        try:
+            photo = entry.read()
+        except (CurviregError, OSError) as error:
+            rows[k] = failed_row(error, skipped="unreadable_image"), None
+            continue
+        if isinstance(registrar, Exception):
+            rows[k] = failed_row(registrar, skipped="unreadable_mesh"), None
+            continue
+        try:
+            prepared[k] = entry, prepare(entry, photo)
+        except CurviregError as error:
+            found[k] = error
+    if isinstance(registrar, Registrar):
+        together = register_entries(list(prepared.values()), registrar, bank_seconds=bank_seconds)
+        found |= zip(prepared, together, strict=True)
     share = (time.perf_counter() - start) / len(entries)
-    rows: list[tuple[Row, bytes | None]] = []
-    for k, one in enumerate(prepared):
-        seconds = {"bank": 0.0 if k else bank_seconds, "register": share}
-        if isinstance(one, Photograph):
-            rows.append(_row(answers[k], one, seconds))
-        elif isinstance(one, CurviregError):
-            rows.append((failed_row(one, seconds=seconds), None))
-        else:
-            rows.append((one, None))
-    return rows
-
-
-def _prepared(entry: Entry, registrar: Registrar | Exception) -> Photograph | CurviregError | Row:
-    """The photograph of an entry, why it cannot be registered, or the row of files that
-    cannot be read."""
-    try:
-        photo = entry.read()
-    except (CurviregError, OSError) as error:
-        return failed_row(error, skipped="unreadable_image")
-    if isinstance(registrar, Exception):
-        return failed_row(registrar, skipped="unreadable_mesh")
-    try:
-        return prepare(entry, photo)
-    except CurviregError as error:
-        return error
-
-
-def _row(
-    found: RegisteredPhotograph | CurviregError,
-    photograph: Photograph,
-    seconds: Mapping[str, float],
-) -> tuple[Row, bytes | None]:
-    """The result of an entry, and its thumbnail; ``seconds`` are those of one without a pose."""
-    if isinstance(found, CurviregError):
+    for k, one in found.items():
+        if isinstance(one, RegisteredPhotograph):
+            rows[k] = {"message": "", **line_document(one.document)}, _thumbnail(one)
+            continue
         places: Row = {}
-        if isinstance(found, LostObjectError) and found.detection is not None:
+        if isinstance(one, LostObjectError) and one.detection is not None:
+            picture = prepared[k][1].facts["picture"]
             places = {
-                "detection": places_document(found.detection),
-                "inputs": {"picture": photograph.facts["picture"]},
+                "detection": places_document(one.detection),
+                "inputs": {"picture": picture},
             }
-        return failed_row(found, seconds=seconds, **places), None
+        seconds = {"bank": 0.0 if k else bank_seconds, "register": share}
+        rows[k] = failed_row(one, seconds=seconds, **places), None
+    return [rows[k] for k in range(len(entries))]
+
+
+def _thumbnail(found: RegisteredPhotograph) -> bytes:
     registrar = found.registrar
     describer = registrar.of_mesh(found.mesh_index).describer
-    box = found.box.tolist()
     copies = drawn_copies(registrar, found.copies)
-    picture = thumbnail(describer, found.projection, found.image, box, copies)
-    return {"message": "", **line_document(found.document)}, picture
+    return thumbnail(describer, found.projection, found.image, found.box.tolist(), copies)
 
 
 def failed_row(error: Exception | str, **values: Any) -> Row:

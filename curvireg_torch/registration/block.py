@@ -16,7 +16,7 @@ from ..fitting.edges import EdgeCrops
 from ..fitting.keypoints import KeypointMatches
 from ..fitting.measured_fit import contour_evidence, measure_contours
 from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
-from ..geometry.framing import CropFrame
+from ..geometry.framing import CropFrame, shown_in
 from ..geometry.pose_prior import object_frame
 from ..matching import Ranking, ViewBank
 from ..mesh.mesh import mesh_centre, mesh_radius
@@ -166,6 +166,38 @@ class Described:
         not count in a photograph."""
         keypoints = self.keypoints[photograph]
         return 0.0 if keypoints is None else math.log1p(keypoints.per_view)
+
+
+def described(
+    target: Target,
+    photographs: Sequence[Photograph],
+    query: QueryFeatures,
+    rankings: Sequence[Ranking],
+    *,
+    contours: bool,
+) -> Described:
+    """Photographs in their boxes, which the matcher has described as ``query`` and ranked; with
+    crops for ``contours``."""
+    crops = None
+    if contours:
+        mask = target.object_mask(query, photographs)
+        images = [item.image for item in photographs]
+        boxes = torch.stack([item.box for item in photographs]).float()
+        shown = torch.stack([target.shown_around(item.box, item.size) for item in photographs])
+        crops = EdgeCrops.cut(images, boxes, target.bank.settings.margin, mask, shown=shown)
+    frames = [target.frame_of(item.box, item.size) for item in photographs]
+    fields = [shown_in(frame, field) for frame, field in zip(frames, query.field, strict=True)]
+    return Described(
+        query=query,
+        rankings=rankings,
+        descriptor=target.describer.descriptor(torch.stack(fields)),
+        crops=crops,
+        keypoints=[
+            target.keypoint_matches(item, item.box) if target.uses_keypoints else None
+            for item in photographs
+        ],
+        frames=frames,
+    )
 
 
 @torch.no_grad()

@@ -24,13 +24,12 @@ from .camera import limits_of, usual_camera
 from .confidence import detection_probability, two_decimals
 from .hypotheses import projected_box
 from .photograph import Photograph, as_photographs, check_crop
-from .result import Detection, FailedRegistration, Registration
+from .result import Detection, FailedRegistration, Registration, Results
 from .stages import map_photographs, register
 from .target import Target
 
 MIN_REGISTERED = 2  # Places that are registered at least, as a fitted pose tells more than its box
 FOUND_CONFIDENCE = 0.1  # Confidence below which the object counts as not found
-Results = list[Registration | FailedRegistration]
 
 
 @torch.no_grad()

@@ -149,7 +149,7 @@ class Photograph:
         return (
             None
             if self.mask is None
-            else crop_squares(self.mask[None], square_boxes(self.box[None], margin), size)
+            else crop_squares(self.mask[None], square_boxes(self.box[None].float(), margin), size)
         )
 
 

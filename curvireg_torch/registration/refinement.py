@@ -25,7 +25,7 @@ from .hypotheses import (
     hypothesis_of,
 )
 from .photograph import MIN_BOX_SIDE, Photograph, as_photographs, check_cameras, check_crop
-from .result import FailedRegistration, Registration
+from .result import Registration, Results
 from .stages import map_photographs, register
 from .target import Target, nearest_view
 
@@ -103,7 +103,7 @@ def refine(
     poses: ArrayLike,
     *,
     start_confidences: Sequence[float | None] | None = None,
-) -> list[Registration | FailedRegistration]:
+) -> Results:
     """Refine poses of a mesh in photographs, without boxes.
 
     Contours are fitted around each start that shows the mesh in the photograph. A start should lie
@@ -150,7 +150,7 @@ def refine_prepared(
     poses: ArrayLike,
     *,
     start_confidences: Sequence[float | None] | None = None,
-) -> list[Registration | FailedRegistration]:
+) -> Results:
     """:func:`refine` in photographs that :func:`.as_photographs` has prepared without boxes."""
     starts = []
     for one in poses:

@@ -24,14 +24,12 @@ from .detection import detect_one
 from .judging import best_of_meshes
 from .photograph import Photograph, as_photographs
 from .refinement import refine
-from .result import FailedRegistration, Registration
+from .result import FailedRegistration, Registration, Results
 from .several import register_views
 from .stages import map_photographs, register_photographs, share_of_worker
 from .target import Target
 
 __all__ = ["Registrar"]
-
-Results = list[Registration | FailedRegistration]
 
 
 class _Task(NamedTuple):

@@ -555,6 +555,9 @@ class FailedRegistration:
         raise self.error
 
 
+Results = list[Registration | FailedRegistration]
+
+
 def likely_rivals(
     probabilities: Sequence[float], pair_probability: float | None, *, is_hidden: bool = False
 ) -> list[int]:

@@ -21,11 +21,11 @@ from ..geometry import rotation_error
 from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
 from ..geometry.crops import box_iou
-from ..geometry.framing import boxes_at, shown_in
+from ..geometry.framing import boxes_at
 from ..geometry.viewpoint import angles_between
 from ..rendering.contours import ContourPoints
 from ..terms import crop_photographs
-from .block import Described, evidence_of
+from .block import Described, described, evidence_of
 from .confidence import MAX_MARGIN, refinement_confidence
 from .hypotheses import Hypotheses
 from .photograph import Photograph
@@ -132,26 +132,14 @@ class RigPhotograph(Described):
     ) -> "RigPhotograph":
         box = item.box.double() if result.corrected_box is None else result.corrected_box
         settings = target.bank.settings
-        boxes = box.float()[None]
-        image = item.image.expand(3, -1, -1)
+        item = replace(item, image=item.image.expand(3, -1, -1), box=box)
         crop = crop_photographs(
-            [image], boxes, size=settings.image_size, margin=settings.margin
+            [item.image], box.float()[None], size=settings.image_size, margin=settings.margin
         ).float()
         query = target.matcher.features(crop.to(target.bank.device))
-        frame = target.frame_of(box, item.size)
-        shown = target.shown_around(box, item.size)
-        mask = target.object_mask(query, [replace(item, box=boxes[0])])
+        seen = described(target, [item], query, [result.ranking], contours=True)
         return RigPhotograph(
-            index=index,
-            camera=camera,
-            photograph=replace(item, box=box),
-            crops=EdgeCrops.cut([image], boxes, settings.margin, mask, shown=shown[None]),
-            query=query,
-            rankings=[result.ranking],
-            descriptor=target.describer.descriptor(shown_in(frame, query.field)),
-            frames=[frame],
-            keypoints=[target.keypoint_matches(item, box) if target.uses_keypoints else None],
-            result=result,
+            **vars(seen), index=index, camera=camera, photograph=item, result=result
         )
 
     @property

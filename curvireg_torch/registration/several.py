@@ -24,7 +24,7 @@ from .confidence import (
 from .detection import detect_prepared
 from .judging import best_of_meshes
 from .photograph import Photograph, as_photographs, check_cameras, copies_of, rig_cameras
-from .result import FailedRegistration, PhotographPose, Registration
+from .result import FailedRegistration, PhotographPose, Registration, Results
 from .rig import ELSEWHERE, JointPoses, Rig, RigPhotograph, RigPhotographs
 from .stages import register_photographs
 from .target import Target
@@ -94,7 +94,7 @@ def register_prepared_views(
     cannot be used."""
     cameras = rig_cameras(T_cam_from_world, items)
     meshes = (target, *target.others)
-    found: list[Registration | FailedRegistration] = []
+    found: Results = []
     for mesh in meshes:
         try:
             found.append(_registered_to(mesh, items, cameras))

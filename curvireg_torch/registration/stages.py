@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..errors import CurviregError
 from ..fitting.edges import EdgeCrops
-from ..geometry.framing import hidden_boxes, shown_in, whole_boxes
+from ..geometry.framing import hidden_boxes, whole_boxes
 from ..matching import Ranking
 from ..matching.search import search
 from ..terms import QueryFeatures
@@ -19,6 +19,7 @@ from ..utils.segments import order_within, place_within
 from .block import (
     Block,
     Limits,
+    described,
     fitted_poses,
     keypoint_poses,
     least_starts,
@@ -48,7 +49,7 @@ from .hypotheses import (
 )
 from .judging import best_of_meshes, compared_with_mirror_image, judged, with_siblings
 from .photograph import Photograph, check_crop
-from .result import FailedRegistration, Registration
+from .result import FailedRegistration, Registration, Results
 from .target import Target
 
 Result = Registration | CurviregError
@@ -81,12 +82,12 @@ def register_photographs(
     target: Target,
     items: Sequence[Photograph | CurviregError],
     others: Sequence[Target] = (),
-) -> list[Registration | FailedRegistration]:
+) -> Results:
     """Register photographs with boxes, in blocks, each to the best of the target and ``others``;
     one that cannot be registered fails alone. Items are read on demand, so that few are in
     memory."""
     size = _block_size(target.bank.device.type)
-    results: list[Registration | FailedRegistration] = []
+    results: Results = []
     meshes = (target, *others)
     with exact_convolutions():
         for first in range(0, len(items), size):
@@ -100,9 +101,9 @@ def register_photographs(
 
 def _register_block(
     target: Target, items: Sequence[Photograph | CurviregError], first: int
-) -> list[Registration | FailedRegistration]:
+) -> Results:
     """Register a few photographs; the ``first`` one's index is that of the caller."""
-    results: list[Registration | FailedRegistration] = []
+    results: Results = []
     registered = _with_corrected_boxes(target, items, register_boxes(target, items))
     for index, (item, result) in enumerate(zip(items, registered, strict=True), first):
         if isinstance(item, CurviregError):
@@ -281,26 +282,10 @@ def rank(target: Target, photographs: Sequence[Photograph], query: QueryFeatures
         target.report_progress("ranking")
     exact = target.is_exact
     limits = [None if item.prior is None else limits_of(target, item) for item in photographs]
-    boxes = torch.stack([item.box for item in photographs])
-    crops = None
-    if target.pipeline.contours:
-        mask = target.object_mask(query, photographs)
-        images = [item.image for item in photographs]
-        shown = torch.stack([target.shown_around(item.box, item.size) for item in photographs])
-        crops = EdgeCrops.cut(images, boxes, target.bank.settings.margin, mask, shown=shown)
-    frames = [target.frame_of(item.box, item.size) for item in photographs]
-    fields = [shown_in(frame, field) for frame, field in zip(frames, query.field, strict=True)]
-    keypoints = [
-        target.keypoint_matches(item, item.box) if target.uses_keypoints else None
-        for item in photographs
-    ]
+    rankings = _rankings(target, query, limits)
+    seen = described(target, photographs, query, rankings, contours=target.pipeline.contours)
     return Block(
-        query=query,
-        rankings=_rankings(target, query, limits),
-        descriptor=target.describer.descriptor(torch.stack(fields)),
-        crops=crops,
-        keypoints=keypoints,
-        frames=frames,
+        **vars(seen),
         photographs=photographs,
         limits=limits,
         exact=exact,

@@ -3,11 +3,13 @@ import pickle
 import re
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import pytest
 from PIL import Image
 
+from curvireg_torch import data
 from curvireg_torch.cli import main
 from curvireg_torch.cli.follow import Tally
 from curvireg_torch.data import Video
@@ -197,8 +199,13 @@ def test_follow_live_drops_frames_that_are_late(frames, follow, tmp_path, monkey
 
 
 @pytest.mark.parametrize("words", [("--camera", "exif"), ("--fov", "49.55")])
-def test_follow_guesses_the_camera_from_the_first_frame(frames, follow, tmp_path, words):
+def test_follow_guesses_the_camera_from_the_first_frame(
+    frames, follow, tmp_path, words, monkeypatch
+):
+    read = Mock(wraps=data.read_photo)
+    monkeypatch.setattr(data, "read_photo", read)
     assert follow(*words, "--out", tmp_path) == 0
+    assert [call.args[0].name for call in read.call_args_list] == [f"{k}.png" for k in range(4)]
     for row, (_, _, T) in zip(table(tmp_path), frames[1], strict=False):
         check_pose(row, T, 4.0, 0.04)
 

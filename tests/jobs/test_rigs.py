@@ -5,12 +5,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from curvireg_torch.errors import MAX_LIST_COLUMNS, InvalidInputError, MissingFileError
 from curvireg_torch.formats.cameras import files as calibrations
+from curvireg_torch.geometry import Camera
 from curvireg_torch.jobs import rigs
+from curvireg_torch.jobs.entry import Entry
 from curvireg_torch.jobs.lists import read_list
 from curvireg_torch.jobs.options import RegisterOptions
+from curvireg_torch.jobs.photograph import prepare_views
 from curvireg_torch.jobs.rigs import read_rig
 from curvireg_torch.utils.files import only_in
 from tests._support.doubling import check_linear
@@ -255,3 +259,20 @@ def test_an_object_that_a_photograph_of_bop_shows_twice_has_no_box_there(tmp_pat
     assert found[0] is not None
     assert float(found[0][0]) == pytest.approx(20.0, abs=1.0), "of the second object"
     assert found[1:] == [None, None]
+
+
+def test_a_photograph_that_does_not_fit_its_camera_leaves_the_others(tmp_path):
+    """It counts as one that cannot be read."""
+    camera = Camera([[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]], size=(180, 240))
+    rows = [("0.png", (240, 180)), ("1.png", (240, 90)), ("none.png", None), ("2.png", (480, 360))]
+    views = []
+    for name, size in rows:
+        if size is not None:
+            Image.new("RGB", size).save(tmp_path / name)
+        T = torch.eye(4, dtype=torch.float64)
+        views.append(Entry(name=name, photo=tmp_path / name, camera=camera, T_cam_from_world=T))
+    first, narrow, missing, last = prepare_views(views)
+    assert (first.size, last.size) == ((180, 240), (360, 480))
+    assert float(last.K[0, 0]) == 520.0
+    assert "another aspect ratio" in str(narrow)
+    assert isinstance(missing, MissingFileError)

@@ -1,6 +1,8 @@
 """Distorted photographs give the poses of undistorted ones, and masks stand in for boxes and
 predicted masks."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -193,3 +195,24 @@ def test_camera_is_scaled_to_each_photograph():
     assert "calibrated for 240 x 180 px, but the photograph has 240 x 90 px" in str(error)
     with pytest.raises(InvalidInputError, match="expected 1, one for each image, got 2"):
         as_photographs([photo], None, [RADIAL, OFF_CENTRE])
+
+
+def test_a_photograph_keeps_the_camera_whose_distortion_was_removed():
+    photo = torch.rand(3, *SIZE)
+    item = as_photograph(photo, None, replace(RADIAL, focal_deviation=0.1, source="exif"))
+    assert torch.equal(item.image, undistorted(photo, RADIAL).image)
+    assert (item.camera.distortion, item.has_box) == (RADIAL.distortion, False)
+    pinhole = item.pinhole
+    assert not pinhole.distorts
+    assert (pinhole.matrix.tolist(), pinhole.size) == (RADIAL.matrix.tolist(), SIZE)
+    assert (pinhole.focal_deviation, pinhole.source) == (0.1, "exif")
+    other = item.by(CAMERA, source="estimated").camera
+    assert torch.equal(other.matrix, CAMERA)
+    assert (other.distortion, other.source) == (RADIAL.distortion, "estimated")
+    unknown = as_photograph(photo, None)
+    assert unknown.pinhole is None
+    assert not unknown.has_estimated_camera
+    usual = unknown.by(CAMERA, source="estimated")
+    assert (usual.camera.size, usual.has_estimated_camera) == (SIZE, True)
+    mask = torch.zeros(SIZE).index_fill(0, torch.arange(20, 60), 1.0)
+    assert as_photograph(photo, None, mask=mask).has_box

@@ -3,6 +3,7 @@ import pickle
 from contextlib import nullcontext
 from copy import copy
 from dataclasses import replace
+from unittest.mock import Mock
 
 import cv2
 import pytest
@@ -33,6 +34,7 @@ from curvireg_torch.registration import (
     stages,
 )
 from curvireg_torch.registration import block as described_module
+from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration.photograph import Photograph, check_crop
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
@@ -459,6 +461,8 @@ def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
     both = Registrar([truck_bank(), truck_bank()])
     found = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
     absent = {both}
+    prepared = Mock(wraps=photograph_module.as_photograph)
+    monkeypatch.setattr(photograph_module, "as_photograph", prepared)
 
     def register(registrar, *_):
         if registrar in absent:
@@ -467,6 +471,7 @@ def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
 
     monkeypatch.setattr(several, "_registered_to", register)
     assert both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None]).mesh_index == 1
+    assert prepared.call_count == 1, "once for both meshes"
     absent.add(both.others[0])
     with pytest.raises(LostObjectError, match="first"):
         both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None])

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar
+from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh
-from curvireg_torch.visualization import registration_sheet
+from curvireg_torch.visualization import contour_overlay, overlay, registration_sheet
 from tests._support.scenes import CAMERA, scene, truck_bank, unrefined
 
 GREEN = (0, 255, 80)
@@ -78,3 +79,17 @@ def test_pictures_are_drawn_from_the_contours_of_the_fit(registered, monkeypatch
     monkeypatch.setattr(registrar.describer, "renderer", whole)
     registration_sheet(registrar, result, image, box)
     assert not whole.method_calls, "no second picture of the whole mesh is rendered"
+
+
+def test_a_prepared_photograph_is_drawn_as_it_is(registered, monkeypatch):
+    """With the part of its box that it shows."""
+    registrar, result, image, box = registered
+    beyond = torch.tensor([-50.0, *box[1:].tolist()])
+    pictures = {
+        draw: draw(registrar, result, image, beyond)
+        for draw in (registration_sheet, contour_overlay)
+    }
+    photograph = replace(as_photograph(image, box, CAMERA), box=beyond.double())
+    monkeypatch.setattr(overlay, "as_photograph", Mock(side_effect=AssertionError))
+    for draw, expected in pictures.items():
+        assert np.array_equal(draw(registrar, result, photograph), expected)
