@@ -1,5 +1,6 @@
 """Fixtures that many tests share. Tests must not change them; a copy is cheap."""
 
+import gc
 import os
 
 # Nearly all that the tests compute is too small for several threads. Set before torch is imported,
@@ -14,6 +15,15 @@ from curvireg_torch.data import BOPDataset, Pascal3DPlus, PoseFolder
 from curvireg_torch.synthetic import example_mesh
 from tests._support import scenes
 from tests._support.miniature import write_bop, write_pascal3d, write_web
+
+# The modules of a session stay: they are not searched for cycles while they are loaded, nor where
+# the code under test asks for it.
+gc.disable()
+
+
+def pytest_collection_finish():
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(config, items):

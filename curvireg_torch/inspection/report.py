@@ -193,9 +193,9 @@ def inspect(
 
     Example:
         >>> import trimesh
-        >>> report = inspect(trimesh.creation.box((1, 2, 3)), n=0)
-        >>> report.facts.is_watertight, len(report.facts.symmetries)
-        (True, 3)
+        >>> report = inspect(trimesh.creation.icosphere(3))
+        >>> report.facts.is_watertight, report.is_hopeless, report.trial
+        (True, True, None)
     """
     check_integer(n, "n", least=0)
     report = progress or report_nothing

@@ -63,7 +63,8 @@ def detect(
         >>> import curvireg_torch as cr
         >>> scene = cr.synthetic.demo_scene()
         >>> views = cr.sample_views(azimuth_step=45, elevations=[20])
-        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> how = {"pipeline": cr.pipeline.PRESETS["fast"], "image_size": 64, "progress": False}
+        >>> bank = cr.ViewBank.build(scene.mesh, views, **how)
         >>> (found,) = detect(cr.Registrar(bank), [scene.image], scene.camera_matrix)
         >>> len(found) >= 1
         True

@@ -230,7 +230,7 @@ def test_strict_tells_by_the_exit_code_whether_a_result_is_reliable(folder, tmp_
 def test_strict_accepts_an_axis_where_it_is_all_that_is_needed(folder, tmp_path, monkeypatch):
     verdicts = []
     monkeypatch.setattr(Registration, "verdict", property(lambda _: verdicts[-1]))
-    files = [str(folder / "photos" / "0.png"), str(folder / "learned.safetensors")]
+    files = [str(folder / "photos" / "0.png"), str(folder / "truck.safetensors")]
     words = ["register", *files, "--box", *box_of(0), "--camera", *CAMERA, "--json", "--quiet"]
     words.append("--no-refine")
     for verdict, need, code in (

@@ -72,13 +72,14 @@ def test_a_process_ends_as_usual_after_a_mistake_in_its_options():
     assert end_of("sys.exit(2)") == (2, ["written", "released", "taken apart"])
 
 
-def test_bank_is_registered_to(folder, register_one, tmp_path, capsys):
+def test_bank_is_registered_to(folder, register_one, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(PRESETS, DEFAULT, SMALL)
     out = tmp_path / "new.safetensors"
     assert (
         main(["bank", str(folder / "truck.ply"), "--out", str(out), "--pose", "upright", "--quiet"])
         == 0
     )
-    assert "288 views" in capsys.readouterr().out
+    assert "6 views" in capsys.readouterr().out
     assert register_one("--no-refine", mesh=out) == 0
 
 
@@ -152,8 +153,8 @@ def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("kind", ["overlay", "fields", "viewpoints"])
-def test_plot_draws_a_registration(tmp_path, monkeypatch, kind):
-    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+def test_plot_draws_a_registration(folder, tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("CURVIREG_CACHE", str(folder / "plotted"))
     box, _ = write_scene(tmp_path)
     words = ["--pipeline", str(tmp_path / "small.json"), "--quiet", "--box", *map(str, box)]
     out = tmp_path / f"{kind}.png"

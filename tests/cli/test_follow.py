@@ -18,6 +18,8 @@ from curvireg_torch.registration import Follower
 from curvireg_torch.visualization import OverlayVideo
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, check_pose, table
+from tests._support.quick import slow_after
+from tests._support.results import registration
 from tests._support.scenes import learned_registrar, sequence
 
 
@@ -71,16 +73,7 @@ def test_frames_without_a_certain_pose_are_spoken_of_once(confidences, said):
 
 
 def test_follow_says_that_it_is_not_sure(follow, tmp_path, monkeypatch, capsys):
-    call = Follower.__call__
-    first = []
-
-    def doubtful(self, *given):
-        if not first:
-            first.append(call(self, *given))
-            object.__setattr__(first[0], "probabilities", (0.1, 0.0))
-        return first[0]
-
-    monkeypatch.setattr(Follower, "__call__", doubtful)
+    monkeypatch.setattr(Follower, "__call__", lambda *_: registration(confidence=0.1))
     follow("--camera", *CAMERA, "--out", tmp_path)
     error = capsys.readouterr().err
     assert error.count("curvireg: not sure of the object yet (best confidence 0.10)") == 1
@@ -177,7 +170,7 @@ def test_follow_takes_the_boxes_of_a_detector_by_frame(frames, follow, tmp_path,
     assert boxes[1:] == [None, None]
 
 
-@pytest.mark.parametrize("source", ["0", "rtsp://camera/stream"])
+@pytest.mark.parametrize("source", slow_after(1, ["rtsp://camera/stream", "0"]))
 def test_follow_live_drops_frames_that_are_late(frames, follow, tmp_path, monkeypatch, source):
     """A video file in the place of a camera, which delivers as fast as it can."""
     opened = []
@@ -198,19 +191,19 @@ def test_follow_live_drops_frames_that_are_late(frames, follow, tmp_path, monkey
     assert names[-1] == "frame-000002"
 
 
-@pytest.mark.parametrize("words", [("--camera", "exif"), ("--fov", "49.55")])
+@pytest.mark.parametrize("words", slow_after(1, ["--fov 49.55", "--camera exif"]))
 def test_follow_guesses_the_camera_from_the_first_frame(
     frames, follow, tmp_path, words, monkeypatch
 ):
     read = Mock(wraps=data.read_photo)
     monkeypatch.setattr(data, "read_photo", read)
-    assert follow(*words, "--out", tmp_path) == 0
+    assert follow(*words.split(), "--out", tmp_path) == 0
     assert [call.args[0].name for call in read.call_args_list] == [f"{k}.png" for k in range(4)]
     for row, (_, _, T) in zip(table(tmp_path), frames[1], strict=False):
         check_pose(row, T, 4.0, 0.04)
 
 
-@pytest.mark.parametrize("kind", ["file", "exif"])
+@pytest.mark.parametrize("kind", slow_after(1, ["file", "exif"]))
 def test_frames_of_another_size_scale_the_camera(frames, follow, tmp_path, kind):
     """As photographs of a list do; a turned frame fails, and the others are followed."""
     folder, scenes = frames

@@ -10,6 +10,7 @@ from curvireg_torch.cli import main
 from curvireg_torch.formats.exports.ros import FILES
 from curvireg_torch.jobs.outputs import MARKER, output_folder
 from tests._support.lists import CAMERA, box_of, lines, table, written
+from tests._support.quick import slow_after
 from tests._support.scenes import scene
 
 
@@ -31,9 +32,9 @@ VIDEOS = [
 ]
 
 
-@pytest.mark.parametrize("names", VIDEOS)
-def test_two_videos_of_one_name_keep_their_own_results(folder, register, tmp_path, names):
-    videos = [write_video(tmp_path / name, [seed]) for seed, name in enumerate(names)]
+@pytest.mark.parametrize(("first", "second"), slow_after(1, VIDEOS))
+def test_two_videos_of_one_name_keep_their_own_results(folder, register, tmp_path, first, second):
+    videos = [write_video(tmp_path / name, [seed]) for seed, name in enumerate((first, second))]
     assert register(*videos, folder / "truck.safetensors", "--box", *box_of(0)) == 0
     rows = table(tmp_path / "out")
     assert [row["photo"] for row in rows] == [f"{video}:000000" for video in videos]

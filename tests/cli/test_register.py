@@ -58,7 +58,7 @@ def test_register_without_box_and_camera(folder, register_one, document, capsys)
     assert "detecting" not in capsys.readouterr().err
     assert main(words) == 0
     assert "0.png: detecting the object" in capsys.readouterr().err
-    assert register_one("--no-refine", "--mesh-is", "similar", box=()) == 0
+    assert register_one("--no-refine", "--mesh-is", "similar") == 0
     assert capsys.readouterr().err == ""
     keys = ("translation", "covariance", "standard_deviations", "camera", "camera_source")
     assert {document()[key] for key in keys} == {None}
@@ -127,7 +127,7 @@ def test_register_takes_views_from_the_bank_unless_a_pipeline_file_is_given(
     assert "pose upright, " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("preset", sorted(PRESETS))
+@pytest.mark.parametrize("preset", slow_after(2, ["learned", "paper", "classical", "fast"]))
 def test_register_equals_registrar_bit_by_bit(folder, register_one, document, monkeypatch, preset):
     monkeypatch.setenv("CURVIREG_CACHE", str(folder / "equal"))
     # The views of every preset, thinned out: 12 instead of 7200.

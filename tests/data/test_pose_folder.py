@@ -1,3 +1,5 @@
+import pickle
+
 import pytest
 import torch
 from torch.utils.data import DataLoader
@@ -49,11 +51,10 @@ def test_pose_folder_refuses_unusable_roots(tree, tmp_path):
 # Python 3.12 warns of fork beside threads
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_datasets_work_with_loader_workers(tree):
+    """Forked ones, and those that get a copy."""
     dataset = PoseFolder(tree[0])
-    for context in ("fork", "spawn"):
-        loader = DataLoader(
-            dataset, 2, num_workers=1, collate_fn=list, multiprocessing_context=context
-        )
+    for sent in (dataset, pickle.loads(pickle.dumps(dataset))):
+        loader = DataLoader(sent, 2, num_workers=1, collate_fn=list, multiprocessing_context="fork")
         samples = [sample for batch in loader for sample in batch]
         assert torch.equal(samples[2]["image"], dataset[2]["image"])
         assert [sample["image_path"] for sample in samples] == [

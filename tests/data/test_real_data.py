@@ -35,6 +35,7 @@ def test_pascal3d_counts():
     assert len(Pascal3DPlus(dataset.root, pixel_origin=0, truncated=False, difficult=False)) == 64
 
 
+@pytest.mark.slow
 def test_pascal3d_projection_fills_the_labelled_box():
     """Offset and distance were fitted to the box; the CAD model of the category has another
     shape."""

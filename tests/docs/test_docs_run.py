@@ -42,14 +42,9 @@ DEFECTIVE = ("data/PASCAL3D+_release1.1", "data/bop/lm", "data/web")
 AZIMUTHS = {"photo.jpg": 30.0, "front.jpg": 210.0, "left.jpg": 300.0, "above.jpg": 120.0}
 FIRST_PAGES = (ROOT / "README.md", DOCS / "getting-started.md")
 SLOW = {
-    DOCS / "evaluation.md",
-    *(
-        DOCS / "guides" / f"{name}.md"
-        for name in (
-            *("several", "coming-from", "boxes", "without-a-box", "unit-and-up", "layers"),
-            *("ambiguous", "photographs", "several-photographs", "known-pose"),
-        )
-    ),
+    *("evaluation", "datasets", "several", "coming-from", "boxes", "without-a-box", "unit-and-up"),
+    *("layers", "ambiguous", "photographs", "several-photographs", "known-pose", "cameras"),
+    *("follow", "pose-prior"),
 }  # the others run some seconds
 
 
@@ -168,7 +163,7 @@ def test_commands_of_a_page_have_the_options_and_blocks_of_python_are_python(
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(p, marks=[pytest.mark.slow] if p in SLOW else [])
+        pytest.param(p, marks=[pytest.mark.slow] if p.stem in SLOW else [])
         for p in PAGES
         if steps(p) and p not in FIRST_PAGES
     ],
@@ -197,6 +192,7 @@ def test_page_runs(page, monkeypatch, capsys):
         assert Path(name).is_file(), f"the page promises {name}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", FIRST_PAGES, ids=lambda page: page.stem)
 def test_the_first_pages_run_on_the_files_of_the_demo_alone(
     page,

@@ -16,6 +16,7 @@ from curvireg_torch.features.backbone import Backbone, describe
 from curvireg_torch.features.learned_field import FieldNetwork, save_weights
 
 from .._support.layer_contract import LayerCase, LayerContract
+from .._support.quick import slow_after
 from ..filters.layer_cases import colour_photos, equal_up_to_sign, photos
 
 
@@ -104,8 +105,16 @@ def test_learned_field_of_a_square_is_its_outline(field):
     assert mask[:8].mean() < 0.2
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize(
+    ("dtype", "channels"),
+    slow_after(
+        2,
+        [
+            *((torch.float16, 3), (torch.float64, 1), (torch.bfloat16, 3)),
+            *((torch.float16, 1), (torch.bfloat16, 1), (torch.float64, 3)),
+        ],
+    ),
+)
 def test_learned_field_with_weights_of_another_dtype(field, dtype, channels):
     x = torch.rand(2, channels, 60, 100, generator=torch.Generator().manual_seed(0))
     converted = LearnedCurvilinearSaliency().to(dtype)

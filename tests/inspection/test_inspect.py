@@ -58,8 +58,14 @@ def hollow_box():
 
 
 @pytest.fixture(scope="module")
-def registrar(small_bank):
-    return Registrar(small_bank, mesh_is="exact")
+def inspected(small_bank):
+    """A registrar, its report, and the progress of that."""
+    registrar = Registrar(small_bank, mesh_is="exact")
+    calls = []
+    report = cr.inspect(
+        registrar, n=1, compare=False, progress=lambda *progress: calls.append(progress)
+    )
+    return registrar, report, calls
 
 
 def test_facts_of_a_closed_body_and_of_its_triangles_apart():
@@ -199,9 +205,8 @@ def test_a_half_hollow_box_looks_alike_from_above_and_not_from_below():
 
 def test_look_alikes_leave_out_symmetries():
     box = as_mesh(trimesh.creation.box((1, 2, 3)))
-    bank = ViewBank.build(
-        box, cr.sample_views(azimuth_step=30, elevations=[-45, 0, 45]), progress=False
-    )
+    views = cr.sample_views(azimuth_step=60, elevations=[-45, 0, 45])
+    bank = ViewBank.build(box, views, image_size=64, progress=False)
     registrar = Registrar(bank, mesh_is="exact")
     symmetries = registrar.symmetries_of(exact=True)
     counted = look_alikes(bank, registrar.describer, None)
@@ -291,12 +296,9 @@ def test_photographs_of_many_faces_show_a_simplified_mesh(monkeypatch, is_colour
         assert (reds == (sides > 0.0))[np.abs(sides) > 0.1].all()
 
 
-def test_trial_counts_right_and_reliable_and_stages_are_reported_in_order(registrar):
-    calls = []
-    report = cr.inspect(
-        registrar, n=2, compare=False, progress=lambda *progress: calls.append(progress)
-    )
-    assert report.trial.expected.n == 2
+def test_trial_counts_right_and_reliable_and_stages_are_reported_in_order(inspected):
+    _, report, calls = inspected
+    assert report.trial.expected.n == 1
     assert not report.trial.compared
     stages = ["mesh", "look-alikes", "photographs"]  # the bank is there
     assert list(dict.fromkeys(stage for stage, _, _ in calls)) == stages
@@ -337,14 +339,14 @@ def test_page_groups_symmetries_by_their_turn():
     assert "in 1 part, closed" in page
 
 
-def test_page_escapes_names(registrar):
-    report = cr.inspect(registrar, n=0)
+def test_page_escapes_names(inspected):
+    registrar, report, _ = inspected
     assert "<b>" not in report_page(report, registrar, title="<b>x").replace("<body>", "")
     assert any(line.startswith("size:") for line in report_lines(report))
 
 
 def test_symmetries_of_colours_are_told_from_those_of_shape():
-    bands = trimesh.creation.cylinder(0.3, 1.0, sections=72).subdivide().subdivide().subdivide()
+    bands = trimesh.creation.cylinder(0.3, 1.0, sections=72).subdivide().subdivide()
     height = bands.triangles_center[:, 2]
     bands.visual.face_colors = np.where(
         height[:, None] > 0.2, (200, 30, 30, 255), (30, 30, 200, 255)
@@ -397,7 +399,7 @@ def test_one_sentence_says_what_looks_alike_and_what_helps():
 
 
 def test_a_print_tells_sides_of_a_box_apart_and_a_plain_one_does_not():
-    views = cr.sample_views(azimuth_step=30, elevations=[-30, 0, 30])
+    views = cr.sample_views(azimuth_step=180, elevations=[0])
     box = trimesh.creation.box((1, 2, 3)).subdivide().subdivide()
     middles = box.triangles_center
     red, blue, white = (200, 30, 30, 255), (30, 30, 200, 255), (250, 250, 250, 255)
@@ -442,8 +444,8 @@ def test_clutter_differs_from_photograph_to_photograph(monkeypatch):
     monkeypatch.setattr("curvireg_torch.inspection.photographs._random_object", recorded)
     generate = PhotographGenerator(trimesh.creation.box((1, 2, 3)), 0, clutter=True)
     first = []
-    for index in range(3):
+    for index in range(2):
         radii.clear()
         generate(index)
         first.append(radii[0])
-    assert len(set(first)) == 3
+    assert first[0] != first[1]

@@ -9,17 +9,21 @@ import trimesh
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError
-from curvireg_torch.pipeline import Pipeline, ViewPolicy
+from curvireg_torch.pipeline import BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 
-FEW_VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
+QUICK = replace(
+    Pipeline(),
+    views=ViewPolicy(pose="upright", azimuth_step=60.0, elevations=(10.0, 40.0)),
+    bank=BankSettings(image_size=64),
+)
 
 
 @pytest.fixture
 def inspect(tmp_path, monkeypatch):
     """Runs the command with few views; returns its exit code and the folder of the report."""
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
-    (tmp_path / "few.json").write_text(replace(Pipeline(), views=FEW_VIEWS).to_json())
+    (tmp_path / "few.json").write_text(QUICK.to_json())
 
     def run(mesh, *words):
         out = tmp_path / "out"

@@ -12,6 +12,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.registration import Follower
 from curvireg_torch.terms import Correlation, QueryFeatures
+from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, scene, sequence
 
 
@@ -74,7 +75,9 @@ def _followed(registrar):
     return follow(frames[1][0]).transform
 
 
-@pytest.mark.parametrize("register", [_boxed, _detected, _refined, _together, _followed])
+@pytest.mark.parametrize(
+    "register", slow_after(2, [_boxed, _followed, _detected, _refined, _together])
+)
 def test_registrar_computes_in_full_precision_under_autocast(small_bank, register):
     detection = replace(small_bank.pipeline.detection, proposals=1)
     pipeline = replace(small_bank.pipeline, detection=detection)

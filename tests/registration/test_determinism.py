@@ -70,7 +70,8 @@ def test_a_photograph_alone_agrees_with_that_of_a_batch(bank, threads):
         check_agreement(one, other)
 
 
-@pytest.mark.parametrize("fitted", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("fitted", [False, True])
 def test_a_detection_alone_agrees_with_that_of_a_batch(bank, threads, fitted):
     pipeline = bank.pipeline if fitted else unrefined(bank)
     threads(1)

@@ -18,6 +18,7 @@ from curvireg_torch.geometry.framing import (
 )
 from curvireg_torch.registration.judging import outside_warnings
 from curvireg_torch.registration.photograph import as_photograph
+from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene
 
 SQUARE = torch.from_numpy(trimesh.creation.box((1.0, 1.0, 0.001)).vertices.copy())
@@ -120,7 +121,7 @@ def test_frame_knows_what_of_a_crop_lies_in_the_photograph():
     assert shown_in(None, field) is field
 
 
-@pytest.mark.parametrize("seed", [9, 11])
+@pytest.mark.parametrize("seed", slow_after(1, [9, 11]))
 def test_half_of_an_object_at_the_border_gives_its_pose(seed):
     image, box, T = scene(seed)
     end = int(0.5 * (box[0] + box[2]))

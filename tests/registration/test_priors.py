@@ -140,10 +140,9 @@ def test_only_rival_outside_tells_whether_a_tight_right_hint_is_wrong():
     assert tight.prior_contradiction is None
     assert tight.confidence > 0.5
     assert tight.confidence >= free.confidence - 0.1
-    for turned in (120.0, 180.0):
-        wrong = registrar(*ONE, prior=around(AZIMUTH + turned, 20.0))[0]
-        assert wrong.prior_contradiction == "better outside"
-        assert not wrong.reliable
+    wrong = registrar(*ONE, prior=around(AZIMUTH + 180.0, 20.0))[0]
+    assert wrong.prior_contradiction == "better outside"
+    assert not wrong.reliable
 
 
 DISTANCE = float(T[:3, 3].norm())  # of the origin, which is near the centre

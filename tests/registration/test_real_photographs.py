@@ -90,7 +90,8 @@ def test_poses_of_exact_meshes(case):
         assert abs(float(shift[2])) < case.depth, f"{key}: {shift.tolist()} of the distance"
 
 
-@pytest.mark.parametrize("case", slow_after(1, SIMILAR), ids=lambda case: case.keys[0])
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SIMILAR, ids=lambda case: case.keys[0])
 def test_viewpoints_of_similar_meshes(case):
     """Without a camera, upright, with the CAD of another object."""
     dataset = Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0, categories=[case.name])

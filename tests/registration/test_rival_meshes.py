@@ -12,6 +12,7 @@ from curvireg_torch.errors import LostObjectError
 from curvireg_torch.fitting.details import ContourDetails
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration.judging import best_of_meshes, joined
+from tests._support.quick import slow_after
 from tests._support.results import registration
 from tests._support.scenes import CAMERA, learned_registrar
 from tests.registration.test_ties import photograph
@@ -41,23 +42,19 @@ def registered(shown, *banks):
 
 
 def test_one_shape_in_two_sizes_is_named_and_not_reliable():
-    banks = bank(), bank(scale=1.2)
-    for order in (banks, banks[::-1]):
-        result = registered(truck(), *order)
-        assert not result.reliable
-        assert result.ambiguous == "mesh 0 or 1"
-        assert sum(result.mesh_probabilities) > 0.9
-        assert result.no_match_probability < 0.1
-        assert result.to_dict()["mesh_probabilities"] == list(result.mesh_probabilities)
+    result = registered(truck(), bank(scale=1.2), bank())
+    assert not result.reliable
+    assert result.ambiguous == "mesh 0 or 1"
+    assert sum(result.mesh_probabilities) > 0.9
+    assert result.no_match_probability < 0.1
+    assert result.to_dict()["mesh_probabilities"] == list(result.mesh_probabilities)
 
 
-@pytest.mark.parametrize("with_cabin", [True, False])
+@pytest.mark.parametrize("with_cabin", slow_after(1, [True, False]))
 def test_a_variant_with_a_part_more_is_told_from_that_without(with_cabin):
-    banks = bank(with_cabin=True), bank(with_cabin=False)
-    for order in (banks, banks[::-1]):
-        result = registered(truck(with_cabin=with_cabin), *order)
-        assert order[result.mesh_index] is bank(with_cabin=with_cabin)
-        assert result.ambiguous is None
+    result = registered(truck(with_cabin=with_cabin), bank(with_cabin=False), bank())
+    assert result.mesh_index == with_cabin
+    assert result.ambiguous is None
 
 
 def result_of(similarity, confidence, rival=0.1):

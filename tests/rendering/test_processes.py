@@ -28,7 +28,6 @@ SCRIPT = """
 import os, sys, torch, trimesh
 from curvireg_torch.errors import RenderingError
 from curvireg_torch.rendering import make_renderer
-from tests._support.quick import slow_after
 
 T = torch.eye(4)[None]; T[0, 2, 3] = 4.0
 K = torch.tensor([[60.0, 0, 19.5], [0, 60.0, 14.5], [0, 0, 1]])

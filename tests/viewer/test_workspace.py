@@ -319,6 +319,7 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
     assert workspace.session.mesh_facts.endswith(" ft, rendered in grey")
 
 
+@pytest.mark.slow
 def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
     """Outline of the cup and its handle, marked by eye in the photograph, in px."""
     sides = [(173, 116), (177, 163), (183, 193), (200, 220), (409, 117), (400, 166), (380, 214)]

@@ -15,6 +15,7 @@ from curvireg_torch.formats.meshes import cad
 from curvireg_torch.formats.meshes.files import mesh_files
 from curvireg_torch.utils import extras
 from curvireg_torch.utils.extras import is_installed
+from tests._support.quick import slow_after
 from tests.formats.meshes.step import iges_file, step_file
 
 BOX = trimesh.creation.box((30.0, 20.0, 10.0))
@@ -25,7 +26,7 @@ def needs(package):
 
 
 @needs("cascadio")
-@pytest.mark.parametrize(("unit", "suffix"), [("cm", "step"), ("in", "STP")])
+@pytest.mark.parametrize(("unit", "suffix"), slow_after(1, [("in", "STP"), ("cm", "step")]))
 def test_step_files_keep_their_unit_and_axes(tmp_path, load, unit, suffix):
     path = tmp_path / f"part.{suffix}"
     path.write_text(step_file((3.0, 2.0, 1.0), unit))
@@ -40,7 +41,9 @@ def test_step_files_keep_their_unit_and_axes(tmp_path, load, unit, suffix):
 
 
 @needs("cascadio")
-@pytest.mark.parametrize(("flag", "name", "unit"), [(2, "MM", "mm"), (1, "IN", "in")])
+@pytest.mark.parametrize(
+    ("flag", "name", "unit"), slow_after(1, [(1, "IN", "in"), (2, "MM", "mm")])
+)
 def test_iges_files_keep_their_unit(write, load, flag, name, unit):
     mesh, _ = load(write("part.igs", iges_file((3.0, 2.0), flag, name)))
     assert mesh.unit == unit
@@ -50,13 +53,16 @@ def test_iges_files_keep_their_unit(write, load, flag, name, unit):
 @needs("cascadio")
 @pytest.mark.parametrize(
     "content",
-    [
-        b"",
-        b"ISO-10303-21;\n",
-        b"nothing",
-        step_file((3, 2, 1), "mm").encode()[:900],
-        b"ISO-10303-21;" * 999,
-    ],
+    slow_after(
+        2,
+        [
+            step_file((3, 2, 1), "mm").encode()[:900],
+            b"",
+            b"ISO-10303-21;\n",
+            b"nothing",
+            b"ISO-10303-21;" * 999,
+        ],
+    ),
 )
 def test_damaged_step_files_are_refused(refused, content):
     refused("part.step", content, r"part\.step: cannot be read as a mesh")

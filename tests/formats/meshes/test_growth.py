@@ -24,7 +24,7 @@ from tests.formats.meshes.test_cad import collada
 from tests.formats.meshes.test_cad import threemf as write_threemf
 from tests.formats.meshes.test_hostile_meshes import tree
 
-UNUSED = 100_000  # vertices
+UNUSED = 30_000  # vertices
 
 
 def resolved(monkeypatch, path):

@@ -12,6 +12,7 @@ from PIL import Image
 import curvireg_torch as cr
 from curvireg_torch.formats.meshes import colours, source
 from curvireg_torch.mesh import as_mesh
+from tests._support.quick import slow_after
 from tests.formats.meshes.test_hostile_meshes import tree
 from tests.formats.meshes.test_obj import write as write_obj
 
@@ -128,7 +129,9 @@ def test_a_texture_of_many_pixels_or_scans_is_left_out(tmp_path, load, monkeypat
     assert "a.png cannot be used" in load(path)[1][0]
 
 
-@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I;16"])
+@pytest.mark.parametrize(
+    "mode", slow_after(3, ["1", "P", "I;16", "L", "LA", "RGB", "RGBA", "CMYK"])
+)
 def test_large_textures_are_reduced_in_every_mode(mode):
     """Before they are converted to RGBA, which would take four times the memory."""
     image = (
