@@ -246,7 +246,9 @@ def test_follow_takes_the_exif_data_unasked_and_else_estimates_the_camera(
     assert "needs the camera with --mesh-is similar" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("confidence", "verdict"), [(None, "reliable"), (0.2, "no match")])
+@pytest.mark.parametrize(
+    ("confidence", "verdict"), slow_after(1, [(None, "reliable"), (0.2, "no match")])
+)
 def test_follow_starts_from_a_known_pose_and_its_confidence(
     frames, follow, tmp_path, monkeypatch, confidence, verdict
 ):

@@ -58,7 +58,7 @@ def test_photographs_of_one_name_keep_their_own_results(folder, register, tmp_pa
         (tmp_path / side).mkdir()
         shutil.copy(folder / "photos" / f"{seed}.png", tmp_path / side / "photo.png")
     photos = tmp_path / "left", tmp_path / "right"
-    assert register(*photos, folder / "truck.safetensors") == 0
+    assert register(*photos, folder / "truck.safetensors", "--box", *box_of(0)) == 0
     rows = table(tmp_path / "out")
     assert [row["photo"] for row in rows] == [str(side / "photo.png") for side in photos]
     assert rows[0]["r11"] != rows[1]["r11"]

@@ -62,9 +62,11 @@ def inspected(small_bank):
     """A registrar, its report, and the progress of that."""
     registrar = Registrar(small_bank, mesh_is="exact")
     calls = []
-    report = cr.inspect(
-        registrar, n=1, compare=False, progress=lambda *progress: calls.append(progress)
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("curvireg_torch.inspection.look_alikes.LOOKED_AT", 12)
+        report = cr.inspect(
+            registrar, n=1, compare=False, progress=lambda *progress: calls.append(progress)
+        )
     return registrar, report, calls
 
 
@@ -203,7 +205,8 @@ def test_a_half_hollow_box_looks_alike_from_above_and_not_from_below():
     assert (angle[elevation > 30] > 170).all(), "half a turn away"
 
 
-def test_look_alikes_leave_out_symmetries():
+def test_look_alikes_leave_out_symmetries(monkeypatch):
+    monkeypatch.setattr("curvireg_torch.inspection.look_alikes.LOOKED_AT", 12)
     box = as_mesh(trimesh.creation.box((1, 2, 3)))
     views = cr.sample_views(azimuth_step=60, elevations=[-45, 0, 45])
     bank = ViewBank.build(box, views, image_size=64, progress=False)

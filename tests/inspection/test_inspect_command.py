@@ -23,6 +23,7 @@ QUICK = replace(
 def inspect(tmp_path, monkeypatch):
     """Runs the command with few views; returns its exit code and the folder of the report."""
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("curvireg_torch.inspection.look_alikes.LOOKED_AT", 12)
     (tmp_path / "few.json").write_text(QUICK.to_json())
 
     def run(mesh, *words):

@@ -1,9 +1,13 @@
 """What tests of meshes share."""
 
+import runpy
+import sys
+
 import pytest
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
+from curvireg_torch.formats.meshes import cad, usd
 from tests._support.meshes import load as load
 
 
@@ -17,6 +21,19 @@ def write(tmp_path):
         return path
 
     return written
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """OpenUSD and OpenCascade read in this process: one of their own takes a second to start."""
+
+    def run(program, arguments, **_):
+        monkeypatch.setattr(sys, "argv", [str(program), *arguments])
+        runpy.run_path(str(program), run_name="__main__")
+        return True
+
+    for module in (cad, usd):
+        monkeypatch.setattr(module, "run_program", run)
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ from tests.formats.meshes.test_ply import header, rows
 from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, painted, square, stage
 
 needs_usd = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
+pytestmark = pytest.mark.usefixtures("here")
 TRIANGLE = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]
 RED = [255, 0, 0]
 GREEN = [0, 255, 0]

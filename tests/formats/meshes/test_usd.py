@@ -15,7 +15,10 @@ from curvireg_torch.mesh.colours import colours_at
 from curvireg_torch.utils import extras
 from curvireg_torch.utils.extras import is_installed
 
-pytestmark = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
+pytestmark = [
+    pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed"),
+    pytest.mark.usefixtures("here"),
+]
 
 SQUARE = """
     def Mesh "square" ({api})
@@ -264,6 +267,7 @@ def test_other_parts_are_named(write, load):
 
 
 def test_bounds(tmp_path, monkeypatch):
+    monkeypatch.undo()  # in a process of its own
     path = tmp_path / "part.usda"
     path.write_text(stage(square()))
     for name, value, match in (
