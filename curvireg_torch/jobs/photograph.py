@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
-from ..data import Photo, load_camera, read_photo
-from ..data.images import photo_of_picture
+from ..data import load_camera
 from ..errors import CurviregError, InvalidInputError
 from ..geometry import Camera, camera_matrix
 from ..geometry.pose_prior import PosePrior
@@ -23,7 +21,7 @@ from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.detection import detect_prepared
 from ..registration.hypotheses import projected_box
-from ..registration.photograph import Photograph, as_photograph
+from ..registration.photograph import Photograph, as_photo
 from ..registration.refinement import refine_prepared
 from ..registration.registrar import ObjectLike
 from ..registration.result import Results
@@ -154,11 +152,7 @@ def register(
     entry = Entry(box=box, camera=_camera(camera), mask=mask, prior=prior)
     if isinstance(image, str | PathLike):
         entry = replace(entry, name=str(image), photo=Path(image))
-        photo = read_photo(image)
-    elif isinstance(image, Image.Image):
-        photo = photo_of_picture(image)
-    else:
-        photo = Photo(as_photograph(image, None).image)
+    photo = as_photo(image)
     if isinstance(mesh, str | PathLike):
         entry = replace(entry, meshes=(Path(mesh),))
         load = load_bank if Path(mesh).suffix == ".safetensors" else load_mesh

@@ -378,16 +378,18 @@ def poses_of_views(
     view: Tensor,
     rank: Tensor,
     photograph: Tensor,
+    *,
     boxes: Tensor | None = None,
+    cameras: Tensor | None = None,
 ) -> Hypotheses:
     """Views (N,) of the bank put into the boxes of their photographs (N,), or into other ``boxes``
-    (N, 4) of these."""
+    (N, 4) of these, by the photographs' cameras or others (N, 3, 3)."""
     rotation = target.bank.rotations.cpu()[view].double()
     distance = target.bank.distances.cpu()[view]
     return Hypotheses.in_boxes(
         target.describer,
         block.boxes[photograph] if boxes is None else boxes,
-        block.cameras[photograph],
+        block.cameras[photograph] if cameras is None else cameras,
         rotation,
         distance,
         view,

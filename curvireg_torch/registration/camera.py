@@ -234,10 +234,8 @@ def _starts_of_cameras(
         )
         photograph = torch.full_like(view, p)
         for camera in possible_cameras(block.photographs[p].size):
-            seen = block.photographs[p].by(camera)
-            parts.append(
-                poses_of_views(target, block.with_photographs({p: seen}), view, rank, photograph)
-            )
+            cameras = camera.expand(len(view), 3, 3)
+            parts.append(poses_of_views(target, block, view, rank, photograph, cameras=cameras))
     poses = block.moved_inside(Hypotheses.cat(parts))
     poses, support = with_short_fit(target.describer, crops, poses)
     evidence = poses.rank + target.pipeline.fit.screening_weight * support

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from PIL.Image import Image as Picture
 from torch import Tensor
 
-from ..data.images import photo_of_picture, read_photo
+from ..data.images import Photo, photo_of_picture, read_photo
 from ..errors import CurviregError, ImageError, InvalidInputError
 from ..formats.masks import mask_of_values, read_mask
 from ..geometry.calibration import Camera, undistorted
@@ -240,61 +240,52 @@ def is_missing(box: BoxLike | None) -> bool:
     return box is None or bool(as_numbers(box, "boxes").isnan().all())
 
 
-def rig_cameras(poses: ArrayLike, items: "Sequence[Photograph | CurviregError]") -> Tensor:
+def rig_cameras(poses: ArrayLike, count: int) -> Tensor:
     """Poses of the cameras of photographs from the world as (V, 4, 4) float64; an error names the
-    photograph: a pose that is not rigid and finite, or that of another photograph by the same
-    camera which shows something else."""
+    photograph of a pose that is not rigid and finite."""
     T = as_numbers(poses, "T_cam_from_world", dtype=torch.float64).detach().cpu().double()
-    check_tensor(T, "T_cam_from_world", (len(items), 4, 4))
+    check_tensor(T, "T_cam_from_world", (count, 4, 4))
     for i, pose in enumerate(T):
         try:
             check_pose(pose, "T_cam_from_world")
         except InvalidInputError as error:
             raise error.of_image(i) from None
-        same = (T[:i] - pose).flatten(1).abs().amax(dim=1) <= 1e-9 * float(pose.abs().max())
-        for j in same.nonzero()[:1, 0].tolist():
-            one = items[j]
-            other = items[i]
-            if (
-                isinstance(one, Photograph)
-                and isinstance(other, Photograph)
-                and _contradict(one, other)
-            ):
-                raise InvalidInputError(
-                    "T_cam_from_world: the same, but they show different things; give each "
-                    "photograph the pose of its own camera",
-                    images=(i, j),
-                )
     return T
 
 
 def copies_of(T: Tensor, items: "Sequence[Photograph | CurviregError]") -> dict[int, int]:
     """Photographs of a rig that show what an earlier one does, by their index, and that one: those
-    that the same camera took from the same place ``T`` (V, 4, 4). They are no further evidence."""
+    that the same camera took from the same place ``T`` (V, 4, 4). They are no further evidence.
+    Refuses two from the very same place that show different things."""
     found: dict[int, int] = {}
-    size = T[:, :3, 3].abs().amax(dim=1).clamp(min=1e-300)
-    for i, pose in enumerate(T):
-        turned = (T[:i, :3, :3] - pose[:3, :3]).flatten(1).abs().amax(dim=1) <= SAME_PLACE
-        near = (T[:i, :3, 3] - pose[:3, 3]).abs().amax(dim=1) <= SAME_PLACE * size[i]
-        for j in (turned & near).nonzero()[:, 0].tolist():
-            one = items[j]
-            other = items[i]
-            if i not in found and j not in found and _by_same_camera(one, other):
+    photographs = {i: item for i, item in enumerate(items) if isinstance(item, Photograph)}
+    for i, one in photographs.items():
+        gap = (T[:i] - T[i]).abs()
+        away = float(T[i, :3, 3].abs().max())
+        turned = gap[:, :3, :3].flatten(1).amax(dim=1) <= SAME_PLACE
+        near = turned & (gap[:, :3, 3].amax(dim=1) <= SAME_PLACE * away)
+        for j in near.nonzero()[:, 0].tolist():
+            other = photographs.get(j)
+            if other is None or not _are_by_same_camera(one, other):
+                continue
+            if float(gap[j].max()) <= 1e-9 * max(away, 1.0) and _contradict(one, other):
+                raise InvalidInputError(
+                    "T_cam_from_world: the same, but they show different things; give each "
+                    "photograph the pose of its own camera",
+                    images=(i, j),
+                )
+            if i not in found and j not in found:
                 found[i] = j
     return found
 
 
-def _by_same_camera(one: Photograph | CurviregError, other: Photograph | CurviregError) -> bool:
-    if isinstance(one, CurviregError) or isinstance(other, CurviregError):
-        return False
+def _are_by_same_camera(one: Photograph, other: Photograph) -> bool:
     near = SAME_PLACE * one.K.abs().max()
     return one.size == other.size and bool((one.K - other.K).abs().max() <= near)
 
 
 def _contradict(one: Photograph, other: Photograph) -> bool:
-    """Whether small copies of two photographs by the same camera are hardly correlated."""
-    if one.size != other.size or not torch.equal(one.K, other.K):
-        return False
+    """Whether small copies of two photographs of one size are hardly correlated."""
     grey = [item.image.float().mean(dim=0).nan_to_num()[None, None] for item in (one, other)]
     a, b = (F.adaptive_avg_pool2d(picture, 32).flatten() for picture in grey)
     return float(F.cosine_similarity(a - a.mean(), b - b.mean(), dim=0)) < SAME_PICTURE
@@ -326,9 +317,10 @@ def as_photograph(
 ) -> Photograph:
     """One photograph in any form, with its (4,) box (None: that of the mask, or the whole image),
     however small."""
-    pixels, recorded = _pixels(image)
+    photo = as_photo(image)
+    pixels = photo.image
     notes = []
-    camera = recorded if camera is None else camera
+    camera = photo.camera() if camera is None else camera
     box = None if box is None else box.detach().float().cpu()
     mask = None if mask is None else _object_mask(mask, pixels)
     if mask is not None:
@@ -420,14 +412,12 @@ class OnDemand(Sequence[Photograph | CurviregError]):
         return self._item(self._indices[index])
 
 
-def _pixels(image: ImageLike) -> tuple[Tensor, Camera | None]:
-    """The pixels of a photograph in any form, and the camera of its EXIF data."""
+def as_photo(image: ImageLike) -> Photo:
+    """The pixels of a photograph in any form, and the metadata of its file."""
     if isinstance(image, str | PathLike):
-        photo = read_photo(image)
-        return photo.image, photo.camera()
+        return read_photo(image)
     if isinstance(image, Picture):
-        photo = photo_of_picture(image)
-        return photo.image, photo.camera()
+        return photo_of_picture(image)
     if isinstance(image, np.ndarray):
         if not (np.issubdtype(image.dtype, np.number) or image.dtype == bool):
             raise InvalidInputError(f"photograph: expected an array of numbers, got {image.dtype}")
@@ -440,7 +430,7 @@ def _pixels(image: ImageLike) -> tuple[Tensor, Camera | None]:
             f"expected a tensor, an array or a path, got {type(image).__name__}"
         )
     check_photograph(image, "photograph")
-    return image, None
+    return Photo(image)
 
 
 def check_crop(crop: Tensor) -> None:

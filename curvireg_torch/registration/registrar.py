@@ -279,9 +279,13 @@ def _register_by_workers(
 ) -> Results:
     """:meth:`.Registrar.register_prepared` by workers, which get a copy of the registrar each; a
     photograph that ends them fails."""
-    tasks = [_Task(number, item, detects) for number, item in enumerate(items)]
-    size = share_of_worker(len(tasks), workers.count)
-    blocks = (tasks[start : start + size] for start in range(0, len(tasks), size))
+    size = share_of_worker(len(items), workers.count)
+    numbers = range(len(items))
+    # items are read on demand, so that few are in memory
+    blocks = (
+        [_Task(number, items[number], detects) for number in numbers[start : start + size]]
+        for start in numbers[::size]
+    )
     found: dict[int, Registration | FailedRegistration] = {}
     for task, result in workers.map(_register_block, _quiet_copy(registrar), blocks):
         if isinstance(result, WorkerError):

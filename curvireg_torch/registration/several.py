@@ -92,12 +92,13 @@ def register_prepared_views(
 ) -> Registration:
     """:func:`register_views` with photographs that :func:`.as_photographs` has prepared, or why one
     cannot be used."""
-    cameras = rig_cameras(T_cam_from_world, items)
+    cameras = rig_cameras(T_cam_from_world, len(items))
+    copies = copies_of(cameras, items)
     meshes = (target, *target.others)
     found: Results = []
     for mesh in meshes:
         try:
-            found.append(_registered_to(mesh, items, cameras))
+            found.append(_registered_to(mesh, items, cameras, copies))
         except CurviregError as error:
             found.append(FailedRegistration(error))
     result = best_of_meshes(found, meshes)
@@ -107,12 +108,14 @@ def register_prepared_views(
 
 
 def _registered_to(
-    target: Target, items: Sequence[Photograph | CurviregError], cameras: Tensor
+    target: Target,
+    items: Sequence[Photograph | CurviregError],
+    cameras: Tensor,
+    copies: Mapping[int, int],
 ) -> Registration:
     """The joint registration to one mesh, of ``cameras`` with these poses (V, 4, 4)."""
     count = target.pipeline.hypotheses
     target = target.with_hypotheses(JOINT_HYPOTHESES)
-    copies = copies_of(cameras, items)
     found: RigPhotographs = {}
     photographs: dict[int, Photograph] = {}
     for i, item in enumerate(items):

@@ -411,7 +411,7 @@ def _of_best_views(
     view = torch.cat([no_view, *(view for view, _ in found)])
     rank = torch.cat([no_view.double(), *(rank for _, rank in found)])
     photograph = torch.tensor(places, dtype=torch.long)[which]
-    poses = poses_of_views(target, block, view, rank, photograph, boxes[which])
+    poses = poses_of_views(target, block, view, rank, photograph, boxes=boxes[which])
     return block.moved_inside(poses)
 
 

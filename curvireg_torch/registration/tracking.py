@@ -437,11 +437,11 @@ class Follower:
         return map_on_threads(lambda image: self._next(image, box), [image])[0]
 
     def _next(self, image: ImageLike, box: BoxLike | None) -> Registration | FailedRegistration:
+        if self._base is None:
+            return self._registered(image, box, BELIEVED_CONFIDENCE)
         item = as_photographs([image], None, self.camera_matrix)[0]
         if not isinstance(item, Photograph):
             return FailedRegistration(item)
-        if self._base is None:
-            return self._registered(item, image, box, BELIEVED_CONFIDENCE)
         tracked: TrackedPose | None = None
         with suppress(LostObjectError, ImageError):  # pixels around the last pose may be unusable
             tracked = self._tracker.track(item.image, item.K)
@@ -469,19 +469,21 @@ class Follower:
             self._tracker.accept(tracked)
             self._base = _confidence(found)
             return found
-        registered = self._registered(item, image, box, self._reliable)
+        registered = self._registered(image, box, self._reliable)
         return (
             registered if isinstance(registered, Registration) and registered.reliable else refined
         )
 
     def _registered(
-        self, item: Photograph, image: ImageLike, box: BoxLike | None, least: float
+        self, image: ImageLike, box: BoxLike | None, least: float
     ) -> Registration | FailedRegistration:
         """Register a frame; track from its pose if it lies within the frame, with a confidence of
         ``least``."""
-        result = self.registrar(
-            [image], None if box is None else [box], self.camera_matrix, prior=self.prior
-        )[0]
+        boxes = None if box is None else [box]
+        item = as_photographs([image], boxes, self.camera_matrix, self.prior)[0]
+        if not isinstance(item, Photograph):
+            return FailedRegistration(item)
+        result = self.registrar.register_prepared([item], detects=box is None)[0]
         if isinstance(result, Registration) and (
             _confidence(result) >= least or (self._base is None and self._is_repeated(result))
         ):

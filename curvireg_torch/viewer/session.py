@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..data import load_camera, read_photo
+from ..data import Photo, load_camera, read_photo
 from ..errors import (
     MAX_VIEWER_PHOTOGRAPHS,
     CurviregError,
@@ -34,13 +34,14 @@ from ..matching import ViewBank
 from ..mesh import Mesh, mesh_centre, mesh_radius
 from ..registration import Registrar, Registration
 from ..registration.photograph import Photograph
+from ..utils.aliases import Fields
 from ..utils.files import only_in
 from ..visualization.pose_glb import mesh_glb
 from .programs import command_line, python_program
 from .shot import Answer, Numbers, Result, Shot, numbers
 
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
-Registered = tuple[Registration, dict[str, Any], Sequence[Photograph]]
+Registered = tuple[Registration, Fields, Sequence[Photograph], list[Tensor | None]]
 UNPACKED = "parts"  # the folder of what was in an archive
 
 
@@ -154,11 +155,17 @@ class Session:
             self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
 
     def _opened(
-        self, path: Path, box: Numbers | None, view: Entry | None, camera: Numbers | Camera | None
+        self,
+        path: Path,
+        box: Numbers | None,
+        view: Entry | None,
+        camera: Numbers | Camera | None,
+        photo: Photo | None = None,
     ) -> Shot:
         """A photograph and a box, those of a ``view`` of a rig if there is one, without the
-        distortion of the camera, which must fit the photograph."""
-        photo = read_photo(path)
+        distortion of the camera, which must fit the photograph. It is read from its file, unless it
+        was ``photo``."""
+        photo = photo or read_photo(path)
         if view is not None:
             camera, _ = view.in_world
             box = box if box is not None or view.box is None else numbers(view.box)
@@ -178,7 +185,8 @@ class Session:
     def _open_again(self, shot: Shot, view: Entry | None, camera: Numbers | Camera | None) -> Shot:
         """A photograph with another camera, or row of a rig. Its box stays unless distortion is
         removed, or no longer is; its result only where no rig is concerned."""
-        opened = self._opened(shot.path, None, view, camera)
+        photo = None if shot.is_undistorted else shot.photo
+        opened = self._opened(shot.path, None, view, camera, photo)
         if opened.is_undistorted or shot.is_undistorted:
             return opened
         if view is not None or shot.view is not None:
@@ -249,15 +257,11 @@ class Session:
         ]
         return rows[0] if rows else None
 
-    def together(self, shot: Shot | None = None) -> list[Shot]:
-        """The photographs that are registered with one, by default the shown one: those of the rig,
-        or it alone."""
-        shot = shot or self.shot
-        return (
-            [shot]
-            if shot.view is None
-            else [one for view in self.rig for one in self.shots if one.view is view]
-        )
+    def together(self) -> list[Shot]:
+        """The photographs that are registered with the shown one: those of the rig, or it alone."""
+        if self.shot.view is None:
+            return [self.shot]
+        return [one for view in self.rig for one in self.shots if one.view is view]
 
     @property
     def rig_name(self) -> str:
@@ -377,16 +381,13 @@ class Session:
         radius = mesh_radius(self.mesh)
         return mesh_glb(self.mesh, transform(frame, -frame @ mesh_centre(self.mesh)) / radius)
 
-    def inputs(
-        self, shot: Shot | None = None
-    ) -> tuple[RegisterOptions, tuple[Numbers | None, ...]]:
-        """The :meth:`request` of a photograph and the boxes of all that are registered with it."""
-        return self.request(shot), tuple(each.box for each in self.together(shot))
+    def inputs(self) -> tuple[RegisterOptions, tuple[Numbers | None, ...]]:
+        """The :meth:`request`, and the boxes of all photographs that are registered together."""
+        return self.request(), tuple(each.box for each in self.together())
 
-    def request(self, shot: Shot | None = None) -> RegisterOptions:
-        """The registration that the inputs describe, in the photograph that is shown, or in
-        another."""
-        shot = shot or self.shot
+    def request(self) -> RegisterOptions:
+        """The registration that the inputs describe, in the photograph that is shown."""
+        shot = self.shot
         camera = self.options.camera
         guess = self.options.guess
         if shot.view is not None:  # the rig has boxes and cameras
@@ -394,7 +395,7 @@ class Session:
         if isinstance(camera, Camera):
             K = camera.matrix if shot.photo is None else camera.at(shot.size).matrix
             camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-        photos = () if shot.photo is None else tuple(each.path for each in self.together(shot))
+        photos = () if shot.photo is None else tuple(each.path for each in self.together())
         meshes = () if self.mesh_path is None else (self.mesh_path,)
         box = None if shot.view is not None else shot.box
         return replace(
@@ -439,14 +440,16 @@ class Session:
             registrar = self.open_registrar(request, self.report_progress)
             registrar.progress = self.report_progress
             register = self._register_alone if shot.view is None else self._register_rig
-            found, boxes = register(shots, request, registrar, time.perf_counter() - start)
+            found = register(shots, request, registrar, time.perf_counter() - start)
             self.report_progress("contours", 1, 1)  # it may have been stopped in the last step
         except CurviregError as error:
             raise (CurviregError("stopped") if self.cancelled else error) from None
         finally:
             self.cancelled = False
             self.searched = ()
-        result = Result(registrar, *found, inputs, Answer(found[0].hypotheses[0]))
+        registration, document, photographs, boxes = found
+        answer = Answer(registration.hypotheses[0])
+        result = Result(registrar, registration, document, photographs, inputs, answer)
         result.document["viewer"] = {"command": command}
         for each, box in zip(shots, boxes, strict=True):
             each.result = result
@@ -455,18 +458,18 @@ class Session:
 
     def _register_alone(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
-    ) -> tuple[Registered, list[Tensor | None]]:
+    ) -> Registered:
         (shot,) = shots
         entry = entry_of(request.photos[0], request)
         meshes = tuple(Path(self.name(path)) for path in entry.meshes)
         entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
         photograph = _prepared(entry, shot, self.options.camera)
         found = register_entry(entry, photograph, registrar, bank_seconds=seconds)
-        return (found, found.document, ()), [found.box.float()]
+        return found, found.document, (), [found.box.float()]
 
     def _register_rig(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
-    ) -> tuple[Registered, list[Tensor | None]]:
+    ) -> Registered:
         views = []
         photographs = []
         for shot in shots:
@@ -479,7 +482,7 @@ class Session:
         )
         document["mesh"] = self.name(request.meshes[0])
         boxes = [view.box for view in registration.views]
-        return (registration, document, photographs), boxes
+        return registration, document, photographs, boxes
 
     def document(self) -> dict[str, Any]:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done

@@ -151,10 +151,15 @@ class Shot:
     found_box: Tensor | None = None
 
     @property
+    def image(self) -> Tensor:
+        """(3, H, W) of the photograph."""
+        assert self.photo is not None
+        return self.photo.image
+
+    @property
     def size(self) -> tuple[int, int]:
         """(H, W) of the photograph."""
-        assert self.photo is not None
-        return int(self.photo.image.shape[-2]), int(self.photo.image.shape[-1])
+        return int(self.image.shape[-2]), int(self.image.shape[-1])
 
     @property
     def is_undistorted(self) -> bool:
@@ -237,12 +242,9 @@ class Shot:
     def fit(self) -> None:
         """Fit the contours at the answer to the photograph's edges."""
         registrar, (T, K) = self.require_result().registrar, self.projection
-        assert self.photo is not None
         contours = registrar.describer.contours
         margin = registrar.bank.settings.margin
-        fit = fit_contours(
-            contours, self.photo.image, self.require_box(), K, T[None], margin=margin
-        )
+        fit = fit_contours(contours, self.image, self.require_box(), K, T[None], margin=margin)
         supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
         self.place(fit.transform[0], f"contours fitted, edge support {supports}")
 
@@ -261,25 +263,19 @@ class Shot:
     def glb(self) -> bytes:
         """The answer as a GLB file, see :func:`curvireg_torch.visualization.pose_glb`."""
         result = self.require_result()
-        assert self.photo is not None
         if result.photographs:
             return views_glb(result.registrar, result.chosen, result.photographs, result.document)
-        return pose_glb(
-            result.registrar.bank.mesh, *result.answer.pose.projection, self.photo.image
-        )
+        return pose_glb(result.registrar.bank.mesh, *result.answer.pose.projection, self.image)
 
     def overlay(self) -> bytes:
         """The contours at the answer on the photograph, or on those of the rig, as a PNG file."""
         result = self.require_result()
-        assert self.photo is not None
         if result.photographs:
             return views_picture(
                 result.registrar, result.chosen, result.photographs, result.document
             )
         return png(
-            contour_overlay(
-                result.registrar, result.answer.pose, self.photo.image, self.require_box()
-            )
+            contour_overlay(result.registrar, result.answer.pose, self.image, self.require_box())
         )
 
 

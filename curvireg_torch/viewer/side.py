@@ -231,11 +231,9 @@ class Answers:
 
     async def _draw_cards(self, shot: Shot) -> None:
         result = shot.require_result()
-        photo = shot.photo
         box = shot.found_box
-        assert photo is not None
-        image = photo.image
-        around = [0, 0, *photo.image.shape[:0:-1]] if box is None else box.tolist()
+        image = shot.image
+        around = [0, 0, *image.shape[:0:-1]] if box is None else box.tolist()
         describer = result.registrar.describer
         hypotheses = result.registration.hypotheses
         probabilities = result.registration.probabilities or (None,) * len(hypotheses)

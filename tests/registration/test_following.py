@@ -42,7 +42,7 @@ def test_follower_starts_from_a_known_pose_without_registering(monkeypatch):
     follow = Follower(registrar, CAMERA)
     follow.start(frames[0][0], frames[0][2])
     monkeypatch.setattr(tracking, "refine_one", None)  # neither search
-    monkeypatch.setattr(type(registrar), "__call__", None)  # nor registration
+    monkeypatch.setattr(type(registrar), "register_prepared", None)  # nor registration
     for image, _, T in frames[1:]:
         result = follow(image)
         degrees, position = errors(result, T)
@@ -58,14 +58,14 @@ def answering(monkeypatch, registrar, answers):
     """Let the registrar give these confidences, one a call, for the true pose of the frame's
     object."""
     given = iter(answers)
-    register = type(registrar).__call__
+    register = type(registrar).register_prepared
 
-    def call(self, images, boxes=None, camera_matrices=None, **options):
-        found = register(self, images, boxes, camera_matrices, **options)[0]
+    def call(self, items, **options):
+        found = register(self, items, **options)[0]
         object.__setattr__(found, "probabilities", (next(given), 0.0))
         return [found]
 
-    monkeypatch.setattr(type(registrar), "__call__", call)
+    monkeypatch.setattr(type(registrar), "register_prepared", call)
 
 
 @pytest.mark.parametrize("first", slow_after(1, [BELIEVED_CONFIDENCE - 0.01, 0.015]))
@@ -108,12 +108,12 @@ def test_registrations_that_disagree_are_not_followed(monkeypatch, degrees, part
     """The second is turned about the object's centre, or moved by a part of its distance."""
     (image, box, _) = sequence(1)[0]
     registrar = truck_registrar()
-    register = type(registrar).__call__
+    register = type(registrar).register_prepared
     centre = registrar.describer.centre
     calls = []
 
-    def call(self, images, boxes=None, camera_matrices=None, **options):
-        found = register(self, images, boxes, camera_matrices, **options)[0]
+    def call(self, items, **options):
+        found = register(self, items, **options)[0]
         object.__setattr__(found, "probabilities", (0.4, 0.0))
         T, K = found.projection
         calls.append(T)
@@ -125,7 +125,7 @@ def test_registrations_that_disagree_are_not_followed(monkeypatch, degrees, part
             object.__setattr__(found, "hypotheses", (first, *found.hypotheses[1:]))
         return [found]
 
-    monkeypatch.setattr(type(registrar), "__call__", call)
+    monkeypatch.setattr(type(registrar), "register_prepared", call)
     follow = Follower(registrar, CAMERA)
     for _ in range(4):
         follow(image, box)
@@ -231,9 +231,8 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
         "curvireg_torch.registration.tracking.tracking_confidence", lambda _: tracked
     )
     monkeypatch.setattr(tracking, "refine_one", LOST)
-    monkeypatch.setattr(
-        Registrar, "__call__", lambda *_, **__: [FailedRegistration(LostObjectError("no"))]
-    )
+    failed = FailedRegistration(LostObjectError("no"))
+    monkeypatch.setattr(Registrar, "register_prepared", lambda *_, **__: [failed])
     result = follow(frames[1][0])
     assert result.ok == kept
     assert not kept or result.confidence == pytest.approx(tracked)

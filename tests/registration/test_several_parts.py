@@ -6,11 +6,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from curvireg_torch.errors import LostObjectError
+from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.evidence import Evidence
+from curvireg_torch.geometry import Camera
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.registration import several
 from curvireg_torch.registration.confidence import hypothesis_probabilities
+from curvireg_torch.registration.photograph import as_photograph, copies_of
 from curvireg_torch.registration.rig import JointPoses
 
 ANY_RIGHT = 0.8
@@ -196,3 +198,30 @@ def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
     assert features["undetermined"] == 3.0
     assert features["unmatched"] == pytest.approx(3.5 - features["keypoints"])
     assert result.warnings == ("a", "b")
+
+
+@pytest.mark.parametrize("away", [0.0, 0.01, 100.0])
+def test_copies_are_of_one_camera_in_one_place(away):
+    """Up to 1e-4 of the distance; what differs from the very same place is a mistake."""
+    image = torch.rand(1, 40, 60)
+    wide = Camera([[50.0, 0, 29.5], [0, 50, 19.5], [0, 0, 1]], size=(40, 60))
+    one = as_photograph(image, None, wide)
+    T = torch.eye(4).double().repeat(2, 1, 1)
+    T[:, 2, 3] = away
+    assert copies_of(T, [one, one]) == {1: 0}
+    assert copies_of(T, [InvalidInputError("dark"), one]) == {}
+    assert copies_of(T, [one, as_photograph(image[:, :30, :45], None, wide)]) == {}
+    assert copies_of(T, [one, one.by(wide.at((44, 66)).matrix)]) == {}
+    other = as_photograph(1.0 - image, None, wide)
+    with pytest.raises(InvalidInputError, match=r"image 1 and image 0: .* show different"):
+        copies_of(T, [one, other])
+    for shift, expected in ((0.5e-4, {1: 0}), (2e-4, {})):
+        moved = T.clone()
+        moved[1, 0, 3] = shift * away
+        if away:
+            assert copies_of(moved, [one, other]) == expected
+        turned = T.clone()
+        turned[1, 0, 1] = shift
+        assert copies_of(turned, [one, other]) == expected
+    three = T[[0, 0, 1]]
+    assert copies_of(three, [one, one, one]) == {1: 0, 2: 0}

@@ -180,7 +180,8 @@ def test_without_the_rig_photographs_are_registered_alone_again(workspace, rig):
     assert ([shot.view for shot in session.shots], len(session.together())) == ([None, None], 1)
     assert not list(workspace.folder.rglob("rig.csv"))
     session.shots[0].set_box((1.0, 2.0, 30.0, 40.0))
-    assert session.request(session.shots[0]).box == (1.0, 2.0, 30.0, 40.0)
+    session.shot = session.shots[0]
+    assert session.request().box == (1.0, 2.0, 30.0, 40.0)
 
 
 @pytest.mark.parametrize(
