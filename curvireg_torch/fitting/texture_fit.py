@@ -38,9 +38,11 @@ MIN_CORRELATION = 0.4
 # patch slides along an edge
 RIVAL_DISTANCE = 4
 CLEAR_MARGIN = 0.1
-# Of the two rounds: the search radius in px, and the scales of robust weights in px, one a step
-FAR_ROUND = (30, (32.0, 16.0, 8.0, 4.0))
-NEAR_ROUND = (6, (6.0, 4.0, 2.0))
+# Of the two rounds: the search radius in px, the scales of robust weights in px, one a step, and
+# with how many samples per pixel and axis the mesh is drawn: more of them in the first round take
+# three times as long and find the same poses
+FAR_ROUND = (30, (32.0, 16.0, 8.0, 4.0), 1)
+NEAR_ROUND = (6, (6.0, 4.0, 2.0), 2)
 # Distance in px at which a corner counts a quarter, and inlier ratios that a pose needs after the
 # first round and after the second: patches seen from another side are found less exactly than those
 # of the next frame, and correlate less
@@ -52,7 +54,7 @@ CONVINCING_RATIO = 0.15
 TURN = 16.0
 JOINT_STEPS = 3  # Steps of the fit to both corners and edges
 MAX_SUPPORT_LOSS = 0.03  # Edge support that a fit may lose
-Draw = Callable[[Tensor, Tensor, tuple[int, int]], Tensor]
+Draw = Callable[[Tensor, Tensor, tuple[int, int], int], Tensor]
 
 
 def surface_corners(
@@ -91,9 +93,9 @@ def fit_texture(
     counts, and is not None, if in the end more corners are in place than at the start, and enough
     of them, and the edge support is as before.
 
-    ``draw`` gives (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a
-    size (H, W). ``problem`` is that of one pose at full size, without a mask, ``photograph`` (C, S,
-    S) its crop; ``starts`` (N, 4, 4) are those of
+    ``draw`` gives (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3), a size
+    (H, W) and samples per pixel and axis. ``problem`` is that of one pose at full size, without a
+    mask, ``photograph`` (C, S, S) its crop; ``starts`` (N, 4, 4) are those of
     :func:`rotated_starts`.
     """
     texture = _TextureRounds(draw, renderer, problem, _grey(photograph))
@@ -161,11 +163,13 @@ class _TextureRounds:
     problem: ContourProblem
     photograph: np.ndarray
 
-    def round(self, start: Tensor, radius: int, scales: tuple[float, ...]) -> _Round | None:
+    def round(
+        self, start: Tensor, radius: int, scales: tuple[float, ...], samples: int
+    ) -> _Round | None:
         """None where the view has few corners, or the photograph few of them."""
         K = self.problem.K
         centre = self.problem.centre
-        matches = self._search(start, radius)
+        matches = self._search(start, radius, samples)
         if matches is None:
             return None
         T = fit_points(matches, start, K, centre, scales)
@@ -178,12 +182,12 @@ class _TextureRounds:
         )
         return _Round(T, matches, before, after)
 
-    def _search(self, T: Tensor, radius: int) -> PointMatches | None:
+    def _search(self, T: Tensor, radius: int, samples: int) -> PointMatches | None:
         """Corners of the view at a pose and where they are in the photograph; None if there are
         few."""
         problem = self.problem
         size = (self.problem.size, self.problem.size)
-        view = _grey(self.draw(T, problem.K, size)[0])
+        view = _grey(self.draw(T, problem.K, size, samples)[0])
         depth = self.renderer.render(T, problem.K, size).cpu()
         levels = (255.0 * view).round().astype(np.uint8)
         corners, model = surface_corners(

@@ -203,9 +203,7 @@ class ViewDescriber:
         """Whether the mesh has colours, and :meth:`draw` can show them."""
         return self._mesh.has_colours and hasattr(self.renderer, "faces_at")
 
-    def draw(
-        self, T: Tensor, K: Tensor, size: tuple[int, int], *, supersampling: int = 2
-    ) -> Tensor:
+    def draw(self, T: Tensor, K: Tensor, size: tuple[int, int], supersampling: int = 2) -> Tensor:
         """(N, 3, H, W) of :func:`curvireg_torch.rendering.render_colour`."""
         return render_colour(
             self._mesh, T, K, size, renderer=self.renderer, supersampling=supersampling

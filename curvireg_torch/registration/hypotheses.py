@@ -4,7 +4,6 @@ filled from views, fits and boxes."""
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -261,9 +260,9 @@ def fit_texture_of(
     problem = ContourProblem.of(describer.contours, crops, one.cameras, one.photograph)
     photograph = crops.crops[int(one.photograph)]
     starts = rotated_starts(one.fit, describer.centre)
-    # more samples take three times as long and find the same poses: docs/experiments.md
-    draw = partial(describer.draw, supersampling=1)
-    fit = fit_texture(draw, describer.renderer, replace(problem, mask=None), photograph, starts)
+    fit = fit_texture(
+        describer.draw, describer.renderer, replace(problem, mask=None), photograph, starts
+    )
     return None if fit is None else one.with_fit(fit, describer.centre)
 
 

@@ -50,8 +50,8 @@ def turned_can(degrees):
 
 
 def fit(renderer, image, starts, mesh=MESH):
-    def draw(T, K, size):
-        return render_colour(mesh, T, K, size, renderer=renderer, supersampling=1)
+    def draw(T, K, size, samples):
+        return render_colour(mesh, T, K, size, renderer=renderer, supersampling=samples)
 
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
     crops = EdgeCrops.cut([image], box.float(), 0.1)
