@@ -2,6 +2,7 @@
 
 import gc
 import os
+from functools import cache
 
 # Nearly all that the tests compute is too small for several threads. Set before torch is imported,
 # and for processes that tests start.
@@ -10,7 +11,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import pytest
 import torch
 
-from curvireg_torch import ViewBank, sample_views
+from curvireg_torch import ViewBank, sample_views, synthetic
 from curvireg_torch.data import BOPDataset, Pascal3DPlus, PoseFolder
 from curvireg_torch.synthetic import example_mesh
 from tests._support import scenes
@@ -22,6 +23,8 @@ gc.disable()
 
 
 def pytest_collection_finish():
+    # many examples draw the same scene, which takes a second
+    synthetic.demo_scene = cache(synthetic.demo_scene)
     gc.freeze()
     gc.enable()
 

@@ -2,6 +2,7 @@
 
 import base64
 import html
+import io
 import json
 import os
 import re
@@ -168,19 +169,14 @@ def test_a_file_that_cannot_be_drawn_costs_no_other(
     assert written == {"result.json", "overlay.png", "pose.glb"} - {file}
 
 
-def test_a_photograph_whose_name_is_no_text_is_registered_and_named(folder, tmp_path):
+def test_a_photograph_whose_name_is_no_text_is_registered_and_named(
+    folder, register, document, tmp_path, monkeypatch
+):
     """Its bytes are no UTF-8; nothing was printed once the result was written."""
     photo = tmp_path / os.fsdecode(b"Gr\xfc\xdfe.png")
     shutil.copy(folder / "photos" / "0.png", photo)
-    words = ["register", photo, folder / "truck.safetensors", "--box", *box_of(0), "--no-refine"]
-    done = subprocess.run(
-        [sys.executable, "-m", "curvireg_torch", *words, "--out", tmp_path / "out"],
-        capture_output=True,
-        check=False,
-        timeout=240,
-        env={**os.environ, "PYTHONIOENCODING": "", "LC_ALL": "C.UTF-8"},
-    )
-    assert (done.returncode, b"Traceback" in done.stderr) == (0, False), done.stderr
-    assert b"viewpoint: " in done.stdout
-    found = json.loads((tmp_path / "out" / "result.json").read_text())
-    assert found["inputs"]["photo"] == str(photo)
+    printed = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(printed, "utf-8", write_through=True))
+    assert register(photo, folder / "truck.safetensors", "--box", *box_of(0)) == 0
+    assert b"viewpoint: " in printed.getvalue()
+    assert document()["inputs"]["photo"] == str(photo)

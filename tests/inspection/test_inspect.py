@@ -137,7 +137,7 @@ def test_flat_meshes_have_a_flat_hull():
 
 
 def test_a_sphere_and_a_wire_are_hopeless():
-    assert mesh_facts(trimesh.creation.icosphere(3)).is_hopeless
+    assert mesh_facts(trimesh.creation.icosphere(2)).is_hopeless
     assert not mesh_facts(trimesh.creation.cylinder(1.0, 2.0)).is_hopeless
     rods = [plate((1, 0.001, 0.001), (0.5, 0, 0)), plate((0.001, 1, 0.001), (0, 0.5, 0))]
     wire = trimesh.util.concatenate([*rods, plate((0.001, 0.001, 1), (0, 0, 0.5))])
@@ -225,13 +225,18 @@ def test_photographs_depend_on_seed_and_number_alone(clutter):
     first = PhotographGenerator(mesh, 5, clutter=clutter)
     again = PhotographGenerator(mesh, 5, clutter=clutter)
     first(0)
-    assert torch.equal(first(1).image, again(1).image)
-    assert torch.equal(first(1).truth, again(1).truth)
+    one = first(1)
+    same = again(1)
+    assert torch.equal(one.image, same.image)
+    assert torch.equal(one.truth, same.truth)
     other = PhotographGenerator(mesh, 6, clutter=clutter)
-    assert not torch.equal(first(1).truth, other(1).truth)
+    assert not torch.equal(one.truth, other(1).truth)
 
 
-def test_upright_photographs_are_seen_from_the_side():
+def test_upright_photographs_are_seen_from_the_side(monkeypatch):
+    drawn = torch.zeros(3, *SIZE), torch.zeros(4)
+    name = "curvireg_torch.inspection.photographs.synthesize_photograph"
+    monkeypatch.setattr(name, lambda *_, **__: drawn)
     generate = PhotographGenerator(example_mesh(), 0, upright=True)
     elevations = [float(cr.viewpoint_from_rotation(generate(k).truth[:3, :3])[1]) for k in range(6)]
     assert min(elevations) > -25.0

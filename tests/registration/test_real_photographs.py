@@ -16,7 +16,6 @@ from curvireg_torch.evaluation.metrics import symmetric_rotation_error
 from curvireg_torch.geometry import projected_boxes, rotation_error, symmetry_transforms, transform
 from curvireg_torch.registration import Follower
 from curvireg_torch.registration.tracking import BELIEVED_CONFIDENCE
-from tests._support.quick import slow_after
 from tests._support.real_data import real_data
 
 pytestmark = pytest.mark.data
@@ -72,7 +71,7 @@ def registered(benchmark, case):
         )
 
 
-@pytest.mark.parametrize("case", slow_after(1, EXACT), ids=lambda case: case.name)
+@pytest.mark.parametrize("case", EXACT, ids=lambda case: case.name)
 def test_poses_of_exact_meshes(case):
     """With camera and box; mesh and translation are in millimetres."""
     protocol = Protocol(pose="any", box_is=case.box_is)
@@ -90,7 +89,6 @@ def test_poses_of_exact_meshes(case):
         assert abs(float(shift[2])) < case.depth, f"{key}: {shift.tolist()} of the distance"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", SIMILAR, ids=lambda case: case.keys[0])
 def test_viewpoints_of_similar_meshes(case):
     """Without a camera, upright, with the CAD of another object."""
@@ -144,7 +142,6 @@ def test_video_is_followed_from_a_box(cube):
         assert result.confidence >= BELIEVED_CONFIDENCE
 
 
-@pytest.mark.slow
 def test_video_without_a_box_believes_no_wrong_pose(cube):
     """The cube stands among other things on a desk, and is not found."""
     registrar, K, images, poses = cube

@@ -143,6 +143,7 @@ def test_photographs_that_fail_are_reported_and_change_nothing(easy, tmp_path):
     assert all(view.failure is None for view in shown.views)
 
 
+@pytest.mark.slow
 def test_boxes_may_be_missing():
     images, boxes, cameras = rig_of(EASY)
     other = photograph(60.0, 4, 0.1)[0]
