@@ -14,7 +14,8 @@ from tests.viewer.test_session import write_scene
 
 
 @pytest.fixture
-def scene(tmp_path):
+def scene(tmp_path, monkeypatch):
+    monkeypatch.setattr("curvireg_torch.inspection.look_alikes.LOOKED_AT", 12)
     write_scene(tmp_path)
     return tmp_path
 
