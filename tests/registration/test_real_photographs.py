@@ -18,7 +18,7 @@ from curvireg_torch.registration import Follower
 from curvireg_torch.registration.tracking import BELIEVED_CONFIDENCE
 from tests._support.real_data import real_data
 
-pytestmark = pytest.mark.data
+pytestmark = [pytest.mark.data, pytest.mark.slow]
 
 
 @dataclass(frozen=True)
