@@ -5,8 +5,11 @@ import torch
 
 from curvireg_torch import Registrar, rotation_error
 from curvireg_torch.errors import CurviregError, InvalidInputError, WorkerError
+from curvireg_torch.registration import FailedRegistration
+from curvireg_torch.registration.photograph import OnDemand
+from curvireg_torch.registration.registrar import _register_by_workers
 from curvireg_torch.utils.executors import Workers
-from tests._support.scenes import CAMERA, scene, truck_bank
+from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
 
 
 class EndsItsProcess:
@@ -45,6 +48,27 @@ def test_a_process_that_ends_is_an_error():
     images = [scene(0)[0]] * 2
     results = registrar(images, scene(0)[1].expand(2, 4), CAMERA)  # by new processes
     assert all(result.ok for result in results)
+
+
+def test_photographs_for_workers_are_read_when_they_are_asked_for():
+    """Not all at once: a block is in memory, and those that wait."""
+    read = []
+
+    def item(number):
+        read.append(number)
+        return InvalidInputError(f"dark {number}")
+
+    class OneByOne(Workers):
+        def map(self, function, state, blocks):
+            for block in blocks:
+                assert len(read) == block[-1].number + 1
+                for task in reversed(block):
+                    yield task, FailedRegistration(task.item)
+
+    registrar = truck_registrar()
+    results = _register_by_workers(registrar, OneByOne(2), OnDemand(item, 70), detects=False)
+    assert [result.error.message for result in results] == [f"dark {k}" for k in range(70)]
+    assert read == list(range(70)), "each once"
 
 
 def test_one_photograph_needs_no_process(monkeypatch):

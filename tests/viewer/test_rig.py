@@ -5,17 +5,19 @@ import json
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import rotation_error
+from curvireg_torch.geometry import Camera, rotation_error
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.jobs.rigs import BOX, CAMERA, ROTATION, TRANSLATION
 from curvireg_torch.jobs.store import to_json
 from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.viewer import session as session_module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.workspace import Workspace
 from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos, written
@@ -53,6 +55,22 @@ def search(workspace):
 
     asyncio.run(work())
     assert workspace.messages == {}
+
+
+def test_a_photograph_is_read_again_only_where_distortion_was_removed(workspace, rig, monkeypatch):
+    read = Mock(wraps=session_module.read_photo)
+    monkeypatch.setattr(session_module, "read_photo", read)
+    session = send(workspace, rig[0], "0.png", "1.png", "rig.csv")
+    assert all(shot.view is not None for shot in session.shots)
+    assert read.call_count == 2
+    asyncio.run(workspace.open_rig(None))
+    assert read.call_count == 2
+    image = session.shots[0].image
+    session.set_camera(Camera(torch.eye(3), (0.1, 0.0, 0.0, 0.0)))
+    assert read.call_count == 2
+    session.set_camera(None)
+    assert read.call_count == 4
+    assert torch.equal(session.shots[0].image, image)
 
 
 @pytest.mark.slow
