@@ -17,16 +17,16 @@ from curvireg_torch.synthetic import example_mesh
 from tests._support import scenes
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
-# The modules of a session stay: they are not searched for cycles while they are loaded, nor where
-# the code under test asks for it.
-gc.disable()
 
-
-def pytest_collection_finish():
-    # many examples draw the same scene, which takes a second
-    synthetic.demo_scene = cache(synthetic.demo_scene)
+@pytest.hookimpl(hookwrapper=True)
+def pytest_collection():
+    """The modules of a session stay: they are not searched for cycles while they are loaded, nor
+    where the code under test asks for it. Examples draw the scene of the demo once."""
+    gc.disable()
+    yield
     gc.freeze()
     gc.enable()
+    synthetic.demo_scene = cache(synthetic.demo_scene)
 
 
 def pytest_collection_modifyitems(config, items):
