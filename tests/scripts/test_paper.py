@@ -97,6 +97,7 @@ def test_tables_rank_by_the_terms_of_the_paper_alone():
     assert measure.variants("any")["corrected"].views == ViewPolicy("any")
 
 
+@pytest.mark.slow
 def test_rankings_find_the_true_view(views):
     for record in views:
         assert max(record["corrected"]["limit"][:3]) < 1e-2, "the truth is in the bank"
@@ -111,6 +112,7 @@ def test_rankings_find_the_true_view(views):
             assert means == sorted(means), "precision grows with k"
 
 
+@pytest.mark.slow
 def test_chance_and_ceiling_stand_below_precision(views):
     records = tables.Records(views, "two photographs")
     precision = tables.precision_tables(records)[0]
@@ -126,6 +128,7 @@ def test_chance_and_ceiling_stand_below_precision(views):
         assert means == sorted(means)
 
 
+@pytest.mark.slow
 def test_the_search_says_between_how_many_views_it_searches(views):
     for record in views:
         for variant in tables.VARIANTS:
@@ -161,6 +164,7 @@ def test_focus_curves_by_threshold_and_precision_by_protocol(root):
     assert [row[0] for row in protocols.rows] == list(tables.PROTOCOLS)
 
 
+@pytest.mark.slow
 def test_closest_is_that_of_the_retrieved_views(views):
     for record in views:
         for pair in tables.PAIRS:
