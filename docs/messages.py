@@ -42,8 +42,9 @@ def messages(package: Path) -> Iterator[tuple[str, str, str]]:
         for function in ast.walk(module):
             if not isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
                 continue
-            texts = assigned(ast.walk(function), constants)
-            for node in ast.walk(function):
+            nodes = list(ast.walk(function))
+            texts = assigned(nodes, constants)
+            for node in nodes:
                 if isinstance(node, ast.Call) and node.args and isinstance(node.func, ast.Name):
                     wrong, semicolon, advice = template(node.args[0], texts).partition("; ")
                     told = semicolon and wrong.strip("… :") and advice.strip("… .")
