@@ -173,9 +173,9 @@ def as_photographs(
     n = len(images)
     no_box = boxes is None
     given: list[Tensor | None]
-    if isinstance(boxes, list | tuple) and any(is_missing(box) for box in boxes):
+    if isinstance(boxes, list | tuple) and any(_is_missing(box) for box in boxes):
         given = [
-            None if is_missing(box) else as_boxes([box], 1)[0]
+            None if _is_missing(box) else as_boxes([box], 1)[0]
             for box in _one_each(boxes, n, "boxes")
         ]
     else:
@@ -235,7 +235,7 @@ def _one_each(values: Iterable[Any], count: int, name: str) -> list[Any]:
     return values
 
 
-def is_missing(box: BoxLike | None) -> bool:
+def _is_missing(box: BoxLike | None) -> bool:
     """Whether a box is None, or all its numbers are NaN."""
     return box is None or bool(as_numbers(box, "boxes").isnan().all())
 
