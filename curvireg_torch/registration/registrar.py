@@ -22,7 +22,7 @@ from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike
 from ..utils.precision import in_full_precision
 from .detection import detect_one
 from .judging import best_of_meshes
-from .photograph import Photograph, as_photographs
+from .photograph import OnDemand, Photograph, as_photographs
 from .refinement import refine
 from .result import FailedRegistration, Registration, Results
 from .several import register_views
@@ -157,7 +157,8 @@ class Registrar(Target):
             images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays, Pillow pictures
                 or paths, C = 1 or 3 (RGB), floating in [0, 1] or uint8. Pictures and files are
                 turned as their EXIF data say.
-            boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`detect`.
+            boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object in all photographs, see
+                :func:`detect`.
             camera_matrices: (B, 3, 3) or (3, 3) in px, a :class:`Camera`, or a list of these. None:
                 the camera of the EXIF data; without, its focal length is estimated with the pose,
                 or with a similar mesh, rotations are relative to a camera that looks at the box.
@@ -176,7 +177,18 @@ class Registrar(Target):
             InvalidInputError: not as many boxes, cameras, priors or masks as images.
         """
         items = as_photographs(images, boxes, camera_matrices, prior, masks)
-        return self.register_prepared(items, detects=boxes is None and masks is None)
+        if boxes is None and masks is None:
+            return self.register_prepared(items, detects=True)
+
+        def located(index: int) -> Photograph | CurviregError:
+            item = items[index]
+            if isinstance(item, CurviregError) or item.has_box:
+                return item
+            return InvalidInputError(
+                "has neither box nor mask; register it in a call without boxes, which searches"
+            ).of_image(index)
+
+        return self.register_prepared(OnDemand(located, len(items)))
 
     @torch.no_grad()
     @in_full_precision

@@ -122,6 +122,18 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
             _ = result.rotation
 
 
+def test_a_photograph_without_a_box_among_others_is_refused_and_not_taken_as_a_whole():
+    registrar = truck_registrar(contours=False)
+    white = torch.ones(IMAGE.shape[1:], dtype=torch.bool)
+    first, second, masked = registrar(
+        [IMAGE] * 3, [BOX, None, None], CAMERA, masks=[None, None, white]
+    )
+    assert first.ok
+    assert masked.ok
+    with pytest.raises(InvalidInputError, match="image 1: has neither box nor mask"):
+        _ = second.rotation
+
+
 def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
     fit_poses = block.fit_poses
     counts = []
