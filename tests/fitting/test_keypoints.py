@@ -269,7 +269,7 @@ def test_meshes_without_colours_and_photographs_without_a_camera_have_no_keypoin
         trimesh.creation.box(), views=cr.sample_views(azimuth_step=180, elevations=[0])
     )
     assert grey.keypoint_matches(item) is None
-    assert registrar().keypoint_matches(replace(item, camera_matrix=None)) is None
+    assert registrar().keypoint_matches(replace(item, camera=None)) is None
     poses, count = block.keypoint_poses(grey, None)
     assert len(poses) == len(count) == 0
 

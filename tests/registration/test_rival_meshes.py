@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ import trimesh
 from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.fitting.details import ContourDetails
-from curvireg_torch.registration import FailedRegistration
+from curvireg_torch.registration import FailedRegistration, judging
 from curvireg_torch.registration.judging import best_of_meshes, joined
 from tests._support.quick import slow_after
 from tests._support.results import registration
@@ -80,6 +81,24 @@ def test_the_mesh_with_the_higher_score_is_the_answer_and_keeps_its_confidence()
         assert found.mesh_index == index
         assert found.confidence == pytest.approx(0.9, abs=0.01)
         assert found.ambiguous is None
+
+
+def test_meshes_with_near_scores_are_compared_in_detail(monkeypatch):
+    """The second is 1 behind the first by its score, and 4 ahead in detail; the third is 7
+    behind."""
+    results = [result_of(similarity, 0.9) for similarity in (0.8, 0.7, 0.1)]
+    first = replace(results[0].hypotheses[0], edge_support=0.5)
+    results[0] = replace(results[0], hypotheses=(first, *results[0].hypotheses[1:]))
+    seen = []
+    gain = torch.tensor([[0.0, -4.0], [4.0, 0.0]])
+    monkeypatch.setattr(judging, "_details_of", lambda _, result, __: seen.append(result))
+    monkeypatch.setattr(judging, "joined", list)
+    monkeypatch.setattr(judging, "compared", lambda _: (gain, None))
+    targets = [learned_registrar()] * 3
+    assert best_of_meshes(results, targets).mesh_index == 0
+    assert seen == []
+    assert best_of_meshes(results, targets, Mock()).mesh_index == 1
+    assert seen == results[:2]
 
 
 def test_meshes_with_equal_scores_share_the_probability():
