@@ -49,8 +49,10 @@ def turned_can(degrees):
     return apply_twist(TRUTH, twist, CENTRE)
 
 
-def fit(renderer, image, starts, mesh=MESH):
+def fit(renderer, image, starts, mesh=MESH, drawn=None):
     def draw(T, K, size, samples):
+        if drawn is not None:
+            drawn.append(samples)
         return render_colour(mesh, T, K, size, renderer=renderer, supersampling=samples)
 
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
@@ -72,6 +74,14 @@ def test_label_determines_the_rotation_about_the_axis(renderer, degrees):
     assert int(found.observable) == 6
     about_axis = R[:, 1] @ found.covariance[0, :3, :3] @ R[:, 1]
     assert float(about_axis.sqrt().rad2deg()) < 10.0
+
+
+def test_a_label_is_found_without_red_and_the_last_round_draws_it_finer(renderer):
+    image = photograph(MESH, TRUTH)
+    without_red = torch.tensor([0.0, 1.0, 1.0])[:, None, None]
+    drawn = []
+    assert error(fit(renderer, image * without_red, turned_can(5.0), drawn=drawn)) < 1.0
+    assert drawn == [1, 2]
 
 
 def test_can_that_is_turned_far_is_found_from_turned_starts(renderer):
