@@ -257,7 +257,7 @@ def register_rig(
     for row, view, item in zip(document["photographs"], rig, photographs, strict=True):
         camera, T = view.in_world
         if isinstance(item, Photograph):
-            camera = camera.at(item.size)
+            camera = item.camera or camera
         row |= {"name": view.name, "photo": str(view.photo), "camera": camera.describe()}
         row["T_cam_from_world"] = T.tolist()
     return result, document

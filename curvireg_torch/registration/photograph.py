@@ -72,7 +72,8 @@ class Photograph:
     Attributes:
         image: (1 or 3, H, W) float or uint8, without distortion.
         box: (4,) of the object, or the whole photograph.
-        camera: of a photograph of this size; its distortion was removed. None if it is unknown.
+        camera: at this size, with the distortion of its lens, of which the image is free; None if
+            it is unknown.
         prior: limits on the pose.
         mask: (H, W) float32 in [0, 1] of the object.
         notes: what is questionable about them, in words.

@@ -1,5 +1,3 @@
-import pickle
-
 import pytest
 import torch
 from torch.utils.data import DataLoader
@@ -8,6 +6,7 @@ from curvireg_torch.data import PoseFolder
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from tests._support.miniature import write_mesh, write_web
+from tests._support.quick import slow_after
 
 
 @pytest.fixture
@@ -50,13 +49,12 @@ def test_pose_folder_refuses_unusable_roots(tree, tmp_path):
 
 # Python 3.12 warns of fork beside threads
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-def test_datasets_work_with_loader_workers(tree):
-    """Forked ones, and those that get a copy."""
+@pytest.mark.parametrize("context", slow_after(1, ["fork", "spawn"]))
+def test_datasets_work_with_loader_workers(tree, context):
     dataset = PoseFolder(tree[0])
-    for sent in (dataset, pickle.loads(pickle.dumps(dataset))):
-        loader = DataLoader(sent, 2, num_workers=1, collate_fn=list, multiprocessing_context="fork")
-        samples = [sample for batch in loader for sample in batch]
-        assert torch.equal(samples[2]["image"], dataset[2]["image"])
-        assert [sample["image_path"] for sample in samples] == [
-            dataset[i]["image_path"] for i in range(4)
-        ]
+    loader = DataLoader(dataset, 2, num_workers=1, collate_fn=list, multiprocessing_context=context)
+    samples = [sample for batch in loader for sample in batch]
+    assert torch.equal(samples[2]["image"], dataset[2]["image"])
+    assert [sample["image_path"] for sample in samples] == [
+        dataset[i]["image_path"] for i in range(4)
+    ]

@@ -140,7 +140,7 @@ def test_every_copy_is_drawn_and_saved(tmp_path, monkeypatch):
     found = found_in(registrar, image, boxes)
     monkeypatch.setattr(photograph, "detect_prepared", lambda *_, **__: [found])
     entry = Entry(name="two.png", photo=tmp_path / "two.png", meshes=(), instances=2)
-    picture = Photo((255 * image).round().byte(), 1, None, ())
+    picture = Photo((255 * image).round().byte())
     result = photograph.register_entry(entry, prepare(entry, picture), registrar)
     assert [copy.detection.box.tolist() for copy in result.copies] == [boxes[1].tolist()]
     instances = result.document["detection"]["instances"]

@@ -153,7 +153,8 @@ def test_confidence_is_a_fraction_of_that_of_the_first_pose_and_not_raised_by_th
     assert max(follow(*frames[0][:2]).confidence for _ in range(5)) <= 0.6
 
 
-def test_a_wrong_start_never_becomes_believed():
+@pytest.mark.parametrize("with_box", slow_after(1, [True, False]))
+def test_a_wrong_start_never_becomes_believed(with_box):
     """Seen from behind: a registration of the next frame does not confirm it."""
     frames = sequence(2)
     behind = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
@@ -161,7 +162,7 @@ def test_a_wrong_start_never_becomes_believed():
     follow.start(frames[0][0], frames[0][2] @ behind)
     follow._base = 0.45  # doubtful
     image, box, T = frames[1]
-    result = follow(image, box)
+    result = follow(image, box if with_box else None)
     assert not result.ok or errors(result, T)[0] < 5.0 or result.confidence < BELIEVED_CONFIDENCE
 
 

@@ -130,7 +130,8 @@ def test_no_hypothesis_exceeds_combined_limits_by_more_than_the_fit_may(seed):
             assert float(prior.excess(hypothesis.rotation)) <= tolerance
 
 
-def test_only_rival_outside_tells_whether_a_tight_right_hint_is_wrong():
+@pytest.mark.parametrize("turned", slow_after(1, [180.0, 120.0]))
+def test_only_rival_outside_tells_whether_a_tight_right_hint_is_wrong(turned):
     """A hint within which no other view lies is no reason for doubt, and one on the far side is
     contradicted."""
     registrar = learned_registrar()
@@ -140,7 +141,7 @@ def test_only_rival_outside_tells_whether_a_tight_right_hint_is_wrong():
     assert tight.prior_contradiction is None
     assert tight.confidence > 0.5
     assert tight.confidence >= free.confidence - 0.1
-    wrong = registrar(*ONE, prior=around(AZIMUTH + 180.0, 20.0))[0]
+    wrong = registrar(*ONE, prior=around(AZIMUTH + turned, 20.0))[0]
     assert wrong.prior_contradiction == "better outside"
     assert not wrong.reliable
 

@@ -183,8 +183,8 @@ def test_pairs_and_axes_are_right_within_their_bounds():
 
 
 def test_finished_tasks_are_kept(tmp_path, monkeypatch):
-    threads = "scripts.calibration.measure.ProcessPoolExecutor"
-    monkeypatch.setattr(threads, lambda jobs, **_: ThreadPoolExecutor(jobs))
+    processes = "scripts.calibration.measure.ProcessPoolExecutor"
+    monkeypatch.setattr(processes, lambda jobs, **_: ThreadPoolExecutor(jobs))
     out = tmp_path / "rows.jsonl"
     tasks = [([k, "a"], k) for k in (1, 2)]
     assert measured(out, tasks, doubled, 1, "") == [{"value": 2}, {"value": 4}]
