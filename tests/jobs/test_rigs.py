@@ -276,3 +276,27 @@ def test_a_photograph_that_does_not_fit_its_camera_leaves_the_others(tmp_path):
     assert float(last.K[0, 0]) == 520.0
     assert "another aspect ratio" in str(narrow)
     assert isinstance(missing, MissingFileError)
+
+
+def test_rows_of_a_rig_have_the_camera_at_the_size_of_the_photograph(tmp_path, monkeypatch):
+    """That of one which cannot be used as it was given."""
+    camera = Camera(
+        [[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]], (0.1, 0.0, 0.0, 0.0), size=(180, 240)
+    )
+    Image.new("RGB", (480, 360)).save(tmp_path / "0.png")
+    rig = [
+        Entry(
+            name=name,
+            photo=tmp_path / name,
+            camera=camera,
+            T_cam_from_world=(number + 1.0) * torch.eye(4, dtype=torch.float64),
+        )
+        for number, name in enumerate(("0.png", "none.png"))
+    ]
+    monkeypatch.setattr(rigs, "register_views", lambda *_: None)
+    monkeypatch.setattr(rigs, "result_document", lambda *_: {"photographs": [{}, {}]})
+    _, document = rigs.register_rig(Path("rig"), rig, prepare_views(rig), None, bank_seconds=0.0)
+    first, second = document["photographs"]
+    assert first["camera"] == camera.at((360, 480)).describe() != camera.describe()
+    assert second["camera"] == camera.describe()
+    assert (first["name"], second["T_cam_from_world"][0]) == ("0.png", [2.0, 0.0, 0.0, 0.0])
