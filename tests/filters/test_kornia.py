@@ -1,15 +1,42 @@
 """Filters are kornia's, and sums of shifted images in graphs: both give the same."""
 
+from contextlib import contextmanager
+
 import kornia
 import pytest
 import torch
+from kornia.filters import spatial_gradient
 
 from curvireg_torch import filters
 from curvireg_torch.filters import operations as ops
-from scripts._shared import read_json
-from scripts.speed import kornia_layers as script
-from scripts.speed.kornia_layers import LAYERS, LIMIT, computed, image_of, table
 from tests._support.numbers import double
+
+LAYERS = {
+    "ImageGradient": filters.ImageGradient(),
+    "ImageCurvilinearSaliency": filters.ImageCurvilinearSaliency(),
+    "MultiScaleFocusCurves": filters.MultiScaleFocusCurves(),
+    "MultiScaleCurvilinearSaliency": filters.MultiScaleCurvilinearSaliency(),
+    "EdgeBlur": filters.EdgeBlur(),
+    "PrincipalCurvatureImage": filters.PrincipalCurvatureImage(),
+}
+"""Those of photographs; of depth, nothing is kornia's."""
+
+
+def kornia_gradient(p):
+    """``ops.central_gradient`` by kornia."""
+    found = spatial_gradient(p, "diff", 1)
+    return found[..., 1:-1, 1:-1].unbind(2)  # the border has replicated neighbours
+
+
+@contextmanager
+def computed(*, by_kornia, gradient=False):
+    """Within, Gaussians are kornia's or sums of shifted images, whatever the library prefers; with
+    ``gradient`` first derivatives are kornia's too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ops, "prefers_shifts", lambda *_: not by_kornia)
+        if gradient:
+            patch.setattr(ops, "central_gradient", kornia_gradient)
+        yield
 
 
 def smoothed(sigma, **options):
@@ -22,7 +49,7 @@ PRIMITIVES = {
     "tensor": smoothed(double(1.7)),
     "large tensor": smoothed(double(6.0)),
     "tensor of zero": smoothed(double(0.0)),
-    # the script's of kornia, the library's never
+    # kornia's here, the library's never
     "first": lambda x: torch.cat(ops.central_gradient(x), dim=1),
 }
 
@@ -46,7 +73,8 @@ def test_both_give_the_same_with_the_same_derivatives(name, shape, dtype):
 
 @pytest.mark.parametrize("name", list(LAYERS))
 def test_layers_are_the_same_by_both(name):
-    image = image_of(48)
+    noise = torch.rand(8, 1, 48, 48, generator=torch.Generator().manual_seed(0))
+    image = filters.gaussian_smooth(noise, 2.0)
     fields = []
     for by_kornia in (False, True):
         with computed(by_kornia=by_kornia):
@@ -109,28 +137,3 @@ def test_grey_levels_are_those_of_kornia_in_graphs_too():
     graph = torch.compile(ops.to_grey, fullgraph=True, backend="eager")
     torch.testing.assert_close(graph(x), ops.to_grey(x))
     torch.testing.assert_close(torch.func.vmap(ops.to_grey)(x[None]), ops.to_grey(x)[None])
-
-
-def test_the_page_shows_the_record_which_is_within_the_limits():
-    layers = read_json(script.OUT)["layers"]
-    page = script.PAGE.read_text(encoding="utf-8")
-    assert layers
-    assert all(line in page for line in table(layers))
-    # with kornia's Gaussian, which layers use; its gradient they do not
-    assert all(entry["forward"]["ratio"] <= LIMIT for entry in layers.values())
-    assert layers["ImageGradient"]["forward with gradient"]["ratio"] > LIMIT
-
-
-def test_measurements_run_and_those_not_repeated_stay(tmp_path, monkeypatch):
-    out = tmp_path / "record.json"
-    words = ["script", "--rounds", "1", "--seconds", "0.0001", "--size", "32", "--out", str(out)]
-    for name in ("ImageCurvilinearSaliency", "ImageGradient"):
-        monkeypatch.setattr("sys.argv", [*words, "--only", name])
-        script.main()
-    layers = read_json(out)["layers"]
-    assert set(layers) == {"ImageCurvilinearSaliency", "ImageGradient"}
-    for entry in layers.values():
-        assert entry["difference"] < 1e-5
-        assert entry["forward"]["ratio"] > 0
-    assert ops.prefers_shifts() is False
-    assert "| ImageGradient | " in "\n".join(table(layers))
