@@ -33,17 +33,18 @@ import numpy as np
 import torch
 import trimesh
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
 from tqdm import tqdm
 
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.mesh import mesh_symmetries
 from scripts._shared import parser_of, read_json, write_json
 from scripts.scenes.families import FAMILIES, random_shape
-from scripts.scenes.materials import random_colour, random_texture
+from scripts.scenes.materials import random_texture
 from scripts.scenes.packages import package
 from scripts.scenes.scene import Scene, camera_path, cut, shelf, simulate_camera, single
 from scripts.scenes.surfaces import Array, Rng
-from scripts.scenes.textured import Texture, TexturedMesh
+from scripts.scenes.textured import TexturedMesh, plain_texture
 from scripts.scenes.tied import FAMILIES as TIED_FAMILIES
 from scripts.scenes.tied import tied_shape
 
@@ -51,7 +52,10 @@ KINDS = ("printed", "shelf", "furniture", "shapes", "tied")
 CADS = ("exact", "similar", "wrong", "print", "mirrored", "variant")
 # fraction of the surface that has the same material after a symmetry of the appearance
 SAME_LOOK = 0.97
-TWIN = 100_000  # added to the number of an object with another print, or of its mirror image
+TWINS = ("print", "mirrored", "variant")
+"""Of these an object is annotated as another one, which has its number and ``TWIN``."""
+
+TWIN = 100_000
 ATTEMPTS = 60  # at a scene of which the right fraction is hidden
 MIN_PIXELS = 400  # of a silhouette; smaller ones are not annotated
 PART_AREA = (0.08, 0.5)  # fraction of the surface that differs in a variant
@@ -62,18 +66,27 @@ FULL_TURN = 12
 
 
 class Packages:
-    """Printed packages; object k depends only on the seed and k."""
+    """Printed packages; object k depends only on the seed and k. A twin has another print."""
 
     photographs: Sequence[Path] = ()  # pictures on walls and floors
 
     def __init__(self, options: Namespace) -> None:
         self.seed = options.seed
+        self.cad = options.cad
         self.ids = list(range(1, options.models + 1))
-        self.written = self.ids  # those with a mesh file
+
+    @property
+    def written(self) -> list[int]:
+        """Objects with a mesh file."""
+        return [k + TWIN for k in self.ids] if self.cad in TWINS else self.ids
+
+    def rng(self, purpose: int, obj_id: int) -> Rng:
+        return np.random.default_rng((self.seed, purpose, obj_id))
 
     @lru_cache(maxsize=100)  # noqa: B019 (lives as long as its process)
     def mesh(self, obj_id: int) -> TexturedMesh:
-        return package(np.random.default_rng((self.seed, 0, obj_id)))
+        other = self.rng(2, obj_id) if obj_id >= TWIN else None
+        return package(self.rng(0, obj_id % TWIN), other)
 
     def symmetries(self, obj_id: int) -> Array:
         return np.eye(3)[None]
@@ -94,20 +107,7 @@ class Packages:
         if picture is None:
             return random_texture(rng)
         picture = cv2.resize(picture, (512, 512), interpolation=cv2.INTER_AREA)[..., ::-1]
-        return np.asarray((picture / 255.0).astype(np.float32) ** 2.2)
-
-
-class Twins(Packages):
-    """Packages, annotated as others of the same shape with another print."""
-
-    def __init__(self, options: Namespace) -> None:
-        super().__init__(options)
-        self.written = [k + TWIN for k in self.ids]
-
-    @lru_cache(maxsize=100)  # noqa: B019
-    def mesh(self, obj_id: int) -> TexturedMesh:
-        other = np.random.default_rng((self.seed, 2, obj_id)) if obj_id >= TWIN else None
-        return package(np.random.default_rng((self.seed, 0, obj_id % TWIN)), other)
+        return (picture / 255.0).astype(np.float32) ** 2.2
 
 
 class Shapes(Packages):
@@ -118,12 +118,9 @@ class Shapes(Packages):
 
     @lru_cache(maxsize=100)  # noqa: B019
     def mesh(self, obj_id: int) -> TexturedMesh:
-        rng = np.random.default_rng((self.seed, 3, obj_id))
+        rng = self.rng(3, obj_id)
         vertices, faces, materials = random_shape(rng, self.group(obj_id))
-        paints = [
-            Texture(random_colour(rng)[None, None].astype(np.float32))
-            for _ in range(int(materials.max()) + 1)
-        ]
+        paints = [plain_texture(rng) for _ in range(int(materials.max()) + 1)]
         size = np.exp(rng.uniform(np.log(0.05), np.log(1.0)))
         mesh = TexturedMesh.from_arrays(size * vertices, faces, paints, paint=materials)
         return mesh.recoloured(paints[0]) if rng.random() < 0.5 else mesh
@@ -132,9 +129,7 @@ class Shapes(Packages):
     def symmetries(self, obj_id: int) -> Array:
         """Those of shape and materials."""
         mesh = self.mesh(obj_id)
-        solid = trimesh.Trimesh(
-            mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.triangles)).reshape(-1, 3)
-        )
+        solid = trimesh.Trimesh(**trimesh.triangles.to_kwargs(mesh.triangles))
         points, faces = trimesh.sample.sample_surface(solid, 4000, seed=0)
         tree = cKDTree(points)
         paint = mesh.paint[faces]
@@ -159,7 +154,6 @@ class Variants(Shapes):
     def __init__(self, options: Namespace) -> None:
         super().__init__(options)
         self.ids = [k for k in self.ids if len(self._parts(k))]
-        self.written = [k + TWIN for k in self.ids]
 
     @lru_cache(maxsize=100)  # noqa: B019
     def mesh(self, obj_id: int) -> TexturedMesh:
@@ -170,11 +164,8 @@ class Variants(Shapes):
     def _parts(self, obj_id: int) -> list[Array]:
         """Of each part of a shape that is neither tiny nor most of it, (F,) whether a face is of
         it."""
-        rng = np.random.default_rng((self.seed, 3, obj_id))
-        _, _, materials = random_shape(rng, self.group(obj_id))
-        corners = super().mesh(obj_id).triangles
-        sides = corners[:, 1:] - corners[:, :1]
-        area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+        _, _, materials = random_shape(self.rng(3, obj_id), self.group(obj_id))
+        area = trimesh.triangles.area(super().mesh(obj_id).triangles)
         low, high = PART_AREA
         parts = [materials == number for number in np.unique(materials)]
         return [part for part in parts if low <= area[part].sum() / area.sum() <= high]
@@ -182,7 +173,7 @@ class Variants(Shapes):
     def _changed(self, mesh: TexturedMesh, obj_id: int) -> TexturedMesh:
         """The mesh with one part folded by 35 to 100 degrees, moved by 0.2 to 0.5 radii, left out,
         or 0.5 to 1.6 times as large."""
-        rng = np.random.default_rng((self.seed, 5, obj_id))
+        rng = self.rng(5, obj_id)
         parts = self._parts(obj_id % TWIN)
         part = parts[int(rng.integers(len(parts)))]
         change = rng.choice(["folded", "moved", "left out", "another size"])
@@ -194,9 +185,8 @@ class Variants(Shapes):
         turn = np.eye(3)
         shift = np.zeros(3)
         if change == "folded":
-            turn = rotation_from_axis_angle(
-                torch.from_numpy(axis * np.radians(rng.uniform(35.0, 100.0)))
-            ).numpy()
+            angle = np.radians(rng.uniform(35.0, 100.0))
+            turn = rotation_from_axis_angle(torch.from_numpy(axis * angle)).numpy()
         elif change == "moved":
             shift = axis * mesh.radius * rng.uniform(0.2, 0.5)
         else:
@@ -218,20 +208,18 @@ class Tied(Shapes):
     def __init__(self, options: Namespace) -> None:
         super().__init__(options)
         self.families = ("handed",) if options.cad == "mirrored" else tuple(TIED_FAMILIES)
-        self.written = [k + TWIN for k in self.ids] if options.cad == "mirrored" else self.ids
 
     @lru_cache(maxsize=100)  # noqa: B019
     def mesh(self, obj_id: int) -> TexturedMesh:
-        rng = np.random.default_rng((self.seed, 4, obj_id % TWIN))
+        rng = self.rng(4, obj_id % TWIN)
         vertices, faces = tied_shape(rng, self.group(obj_id % TWIN))
         if obj_id >= TWIN:
             vertices = vertices * (-1.0, 1.0, 1.0)
             faces = faces[:, ::-1]
-        paint = Texture(random_colour(rng)[None, None].astype(np.float32))
+        paint = plain_texture(rng)
         return TexturedMesh.from_arrays(rng.uniform(0.03, 0.3) * vertices, faces, [paint])
 
-    def symmetries(self, obj_id: int) -> Array:
-        return np.eye(3)[None]
+    symmetries = Packages.symmetries
 
 
 class Furniture(Packages):
@@ -246,14 +234,18 @@ class Furniture(Packages):
         good = [m for m in rows if min(m["extents"]) > 0.08 * max(m["extents"])]
         good = [m for m in good if len(set(m["look_symmetries"]) & about_z) < FULL_TURN]
         self.surroundings = [m for m in rows if m["faces"] < 6000]
-        self.rows: dict[int, dict[str, Any]] = dict(enumerate(good, 1))
-        self.seed, self.ids = options.seed, list(self.rows)
+        self.rows = dict(enumerate(good, 1))
+        self.seed = options.seed
+        self.ids = list(self.rows)
         if options.cad == "similar":
             self.ids = [k for k in self.rows if self._siblings(k)]
-        self.written = list(self.rows)
         textures = sorted(p for m in rows for p in (self.folder / m["path"]).parent.glob("*.jpg"))
         self.photographs = [p for p in textures if p.stat().st_size > 8000]
         self.names = "shape_symmetries" if options.cad == "similar" else "look_symmetries"
+
+    @property
+    def written(self) -> list[int]:
+        return list(self.rows)
 
     @lru_cache(maxsize=100)  # noqa: B019
     def _load(self, path: str) -> TexturedMesh:
@@ -297,91 +289,109 @@ def model_row(objects: Packages, folder: Path, obj_id: int) -> dict[str, Any]:
     if not path.exists():
         mesh.save_ply(path)
     low = 1000.0 * mesh.hull.min(axis=0)
-    high = 1000.0 * mesh.hull.max(axis=0)
-    row = {
-        "diameter": 1000.0
-        * float(np.linalg.norm(mesh.hull[:, None] - mesh.hull[None], axis=2).max())
-    }
+    size = 1000.0 * mesh.hull.max(axis=0) - low
+    row = {"diameter": 1000.0 * float(pdist(mesh.hull).max())}
     row |= {f"min_{c}": float(x) for c, x in zip("xyz", low, strict=True)}
-    row |= {f"size_{c}": float(x) for c, x in zip("xyz", high - low, strict=True)}
+    row |= {f"size_{c}": float(x) for c, x in zip("xyz", size, strict=True)}
     discrete = []
     for S in objects.symmetries(obj_id)[1:]:
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = S, 1000.0 * (mesh.centre - S @ mesh.centre)
+        T[:3, :3] = S
+        T[:3, 3] = 1000.0 * (mesh.centre - S @ mesh.centre)
         discrete.append(T.round(6).ravel().tolist())
-    return row | ({"symmetries_discrete": discrete} if discrete else {})
+    if discrete:
+        row["symmetries_discrete"] = discrete
+    return row
+
+
+Annotated = dict[int, tuple[int, TexturedMesh]]
+"""Of each object of a scene: what it is annotated as, obj_id and mesh."""
 
 
 def compose(
     objects: Packages, options: Namespace, index: int, attempt: int
-) -> tuple[Scene, dict[int, Any]]:
-    """Scene ``index``, and the mesh that each of its objects is annotated as: obj_id and mesh."""
+) -> tuple[Scene, Annotated]:
+    """Scene ``index``."""
     rng = np.random.default_rng((options.seed, index, attempt))
-    size = tuple(options.size)
-    ids = objects.ids
     if options.kind == "shelf":
-        low, high = options.objects
-        chosen = rng.choice(ids, min(int(rng.integers(low, high + 1)), len(ids)), replace=False)
-        meshes = [(int(k), objects.mesh(int(k))) for k in chosen]
-        scene = shelf(
-            meshes,
-            objects.texture,
-            rng,
-            size=size,
-            occlusion=options.occlusion,
-            cameras=options.cameras,
-        )
-        annotated = {k: (k, mesh) for k, mesh in meshes}
+        scene, annotated = full_shelf(objects, options, rng)
     else:
-        shown = ids[
-            np.random.default_rng((options.seed, 1)).permutation(len(ids))[index % len(ids)]
-        ]
-        mesh = objects.mesh(shown)
-        if options.bare and rng.random() < options.bare:
-            mesh = mesh.recoloured(Texture(random_colour(rng)[None, None].astype(np.float32)))
-        upright = options.pose == "upright" or (options.pose == "mixed" and index % 2 == 0)
-        occluded = bool(options.hidden or (rng.random() < 0.3 and attempt < 12))
-        more = {"upright": upright, "occluded": occluded, "cameras": options.cameras, "size": size}
-        scene = single(mesh, shown, objects.clutter, objects.texture, rng, **more)
-        named = shown
-        if options.cad == "similar":
-            named = objects.similar(shown, rng)
-        elif options.cad in ("print", "mirrored", "variant"):
-            named = shown + TWIN
-        elif options.cad == "wrong":
-            others = [k for k in ids if objects.group(k) != objects.group(shown)]
-            named = int(rng.choice(others))
-        annotated = {shown: (named, objects.mesh(named))}
-        if options.cut:
-            fraction = float(rng.uniform(*options.cut))
-            hull = scene.shapes[0].hull
-            scene = replace(
-                scene, views=[cut(view, hull, size, fraction, rng) for view in scene.views]
-            )
+        scene, annotated = lone_object(objects, options, index, attempt, rng)
     if options.frames > 1:
-        points = np.concatenate([shape.hull for shape in scene.shapes if shape.obj_id is not None])
+        points = np.concatenate([shape.hull for shape in scene.annotated])
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
         scene = replace(scene, views=camera_path(scene.views[0], middle, options.frames, rng))
     return scene, annotated
 
 
-def make_scene(objects: Packages, options: Namespace, index: int) -> list[list[float]]:
-    """Write scene ``index`` unless it exists; the visible fractions of each photograph's
-    objects."""
+def full_shelf(objects: Packages, options: Namespace, rng: Rng) -> tuple[Scene, Annotated]:
+    low, high = options.objects
+    count = min(int(rng.integers(low, high + 1)), len(objects.ids))
+    chosen = rng.choice(objects.ids, count, replace=False).tolist()
+    annotated = {k: (k, objects.mesh(k)) for k in chosen}
+    scene = shelf(
+        list(annotated.values()),
+        objects.texture,
+        rng,
+        size=options.size,
+        occlusion=options.occlusion,
+        cameras=options.cameras,
+    )
+    return scene, annotated
+
+
+def lone_object(
+    objects: Packages, options: Namespace, index: int, attempt: int, rng: Rng
+) -> tuple[Scene, Annotated]:
+    """Objects take turns, in a random order."""
+    order = np.random.default_rng((options.seed, 1)).permutation(len(objects.ids))
+    shown = objects.ids[order[index % len(order)]]
+    mesh = objects.mesh(shown)
+    if options.bare and rng.random() < options.bare:
+        mesh = mesh.recoloured(plain_texture(rng))
+    scene = single(
+        mesh,
+        shown,
+        objects.clutter,
+        objects.texture,
+        rng,
+        size=options.size,
+        upright=options.pose == "upright" or (options.pose == "mixed" and index % 2 == 0),
+        occluded=bool(options.hidden or (rng.random() < 0.3 and attempt < 12)),
+        cameras=options.cameras,
+    )
+    named = shown
+    if options.cad == "similar":
+        named = objects.similar(shown, rng)
+    elif options.cad in TWINS:
+        named = shown + TWIN
+    elif options.cad == "wrong":
+        own = objects.group(shown)
+        named = int(rng.choice([k for k in objects.ids if objects.group(k) != own]))
+    if options.cut:
+        fraction = float(rng.uniform(*options.cut))
+        hull = scene.shapes[0].hull
+        views = [cut(view, hull, options.size, fraction, rng) for view in scene.views]
+        scene = replace(scene, views=views)
+    return scene, {shown: (named, objects.mesh(named))}
+
+
+def make_scene(objects: Packages, options: Namespace, index: int) -> None:
+    """Write scene ``index`` unless it exists."""
     folder = options.out / "test" / f"{index:06d}"
     if folder.exists():
-        infos = read_json(folder / "scene_gt_info.json")
-        return [[entry["visib_fract"] for entry in infos[key]] for key in sorted(infos, key=int)]
+        return
     least, most = options.hidden or (0.0, options.occlusion)
     for attempt in range(ATTEMPTS):
         scene, annotated = compose(objects, options, index, attempt)
-        pictures = [scene.render(view, tuple(options.size)) for view in scene.views]
-        wholes = np.array([p.whole.sum(axis=(1, 2)) for p in pictures])
-        fractions = np.array([p.seen.sum(axis=(1, 2)) for p in pictures]) / np.maximum(wholes, 1)
-        is_hidden = 1.0 - fractions
-        if (wholes[:, 0] >= MIN_PIXELS).all() and (
-            options.kind == "shelf" or (is_hidden.min() >= least and is_hidden.max() <= most)
-        ):
+        pictures = [scene.render(view, options.size) for view in scene.views]
+        seen, whole = (
+            np.array([getattr(p, name).sum(axis=(1, 2)) for p in pictures])
+            for name in ("seen", "whole")
+        )
+        hidden = 1.0 - seen / np.maximum(whole, 1)
+        is_right = options.kind == "shelf" or (hidden.min() >= least and hidden.max() <= most)
+        if is_right and (whole[:, 0] >= MIN_PIXELS).all():
             break
     else:
         raise RuntimeError(f"scene {index}: too much or too little is hidden in every attempt")
@@ -389,37 +399,50 @@ def make_scene(objects: Packages, options: Namespace, index: int) -> list[list[f
     shutil.rmtree(part, ignore_errors=True)
     (part / "rgb").mkdir(parents=True)
     truths = {}
-    cameras = {}
     infos = {}
-    targets = [shape for shape in scene.shapes if shape.obj_id is not None]
+    cameras = {}
+    mm = 1000.0 / scene.annotated[0].scale
     for k, ((R, t, K), picture) in enumerate(zip(scene.views, pictures, strict=True)):
         seed = (options.seed, index, 0 if options.frames > 1 else k)  # one camera takes all frames
         image = simulate_camera(picture.linear, np.random.default_rng(seed))
         cv2.imwrite(str(part / "rgb" / f"{k:06d}.png"), image[..., ::-1])
-        mm = 1000.0 / targets[0].scale
-        cameras[k] = {"cam_K": K.ravel().tolist(), "depth_scale": 1.0}
-        cameras[k] |= {"cam_R_w2c": R.ravel().tolist(), "cam_t_w2c": (mm * t).tolist()}
-        truths[k], infos[k] = [], []
-        for n, shape in enumerate(targets):
-            if picture.whole[n].sum() < MIN_PIXELS:
+        cameras[k] = {
+            "cam_K": K.ravel().tolist(),
+            "depth_scale": 1.0,
+            "cam_R_w2c": R.ravel().tolist(),
+            "cam_t_w2c": (mm * t).tolist(),
+        }
+        truths[k] = []
+        infos[k] = []
+        masks = zip(scene.annotated, picture.seen, picture.whole, strict=True)
+        for shape, seen_mask, whole_mask in masks:
+            count = int(whole_mask.sum())
+            if count < MIN_PIXELS:
                 continue
             obj_id, mesh = annotated[shape.obj_id]
             rotation, translation = shape.pose(R, t)
             translation = translation + rotation @ (shape.mesh.centre - mesh.centre)
-            pose = {
-                "cam_R_m2c": rotation.ravel().tolist(),
-                "cam_t_m2c": (1000.0 * translation).tolist(),
-            }
-            truths[k].append(pose | {"obj_id": obj_id})
-            seen = int(picture.seen[n].sum())
-            whole = int(picture.whole[n].sum())
-            boxes = {"bbox_obj": _box(picture.whole[n]), "bbox_visib": _box(picture.seen[n])}
-            counts = {"px_count_all": whole, "px_count_visib": seen, "px_count_valid": whole}
-            infos[k].append(boxes | counts | {"visib_fract": seen / whole})
+            truths[k].append(
+                {
+                    "cam_R_m2c": rotation.ravel().tolist(),
+                    "cam_t_m2c": (1000.0 * translation).tolist(),
+                    "obj_id": obj_id,
+                }
+            )
+            visible = int(seen_mask.sum())
+            infos[k].append(
+                {
+                    "bbox_obj": _box(whole_mask),
+                    "bbox_visib": _box(seen_mask),
+                    "px_count_all": count,
+                    "px_count_visib": visible,
+                    "px_count_valid": count,
+                    "visib_fract": visible / count,
+                }
+            )
     for name, content in (("gt", truths), ("camera", cameras), ("gt_info", infos)):
         write_json(part / f"scene_{name}.json", content)
     part.rename(folder)
-    return [[entry["visib_fract"] for entry in infos[k]] for k in infos]
 
 
 def _box(mask: Array) -> list[int]:
@@ -440,16 +463,16 @@ def write_targets(options: Namespace) -> int:
         truths, infos = (read_json(folder / f"scene_{name}.json") for name in ("gt", "gt_info"))
         for key in sorted(truths, key=int):
             for truth, info in zip(truths[key], infos[key], strict=True):
-                if (
-                    info["visib_fract"] >= 1.0 - options.occlusion
-                    and min(info["bbox_visib"][2:]) > 0
-                ):
-                    row = {
+                if info["visib_fract"] < 1.0 - options.occlusion or min(info["bbox_visib"][2:]) < 1:
+                    continue
+                targets.append(
+                    {
                         "scene_id": int(folder.name),
                         "im_id": int(key),
                         "obj_id": truth["obj_id"],
+                        "inst_count": 1,
                     }
-                    targets.append(row | {"inst_count": 1})
+                )
     write_json(options.out / "test_targets_bop19.json", targets)
     return len(targets)
 
@@ -462,12 +485,11 @@ def _start(options: Namespace) -> None:
     cv2.setNumThreads(1)
     shapes = Variants if options.cad == "variant" else Shapes
     kinds = {"furniture": Furniture, "shapes": shapes, "tied": Tied}
-    packages = Twins if options.cad == "print" else Packages
-    _state[:] = [kinds.get(options.kind, packages)(options), options]
+    _state[:] = [kinds.get(options.kind, Packages)(options), options]
 
 
-def _one(index: int) -> list[list[float]]:
-    return make_scene(*_state, index)
+def _one(index: int) -> None:
+    make_scene(*_state, index)
 
 
 def _model(obj_id: int) -> dict[str, Any]:
@@ -534,14 +556,12 @@ def main() -> None:
         options.jobs, get_context("spawn"), initializer=_start, initargs=(options,)
     ) as pool:
         rows = list(tqdm(pool.map(_model, ids, chunksize=4), total=len(ids), desc="models"))
-        write_json(
-            models / "models_info.json", {str(k): row for k, row in zip(ids, rows, strict=True)}
-        )
+        write_json(models / "models_info.json", dict(zip(ids, rows, strict=True)))
         list(tqdm(pool.map(_one, range(options.count)), total=options.count, desc="scenes"))
     kept = {
-        k: str(v) if isinstance(v, Path) else v
-        for k, v in vars(options).items()
-        if k not in ("out", "jobs")
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in vars(options).items()
+        if name not in ("out", "jobs")
     }
     groups = {obj_id: objects.group(obj_id % TWIN) for obj_id in objects.written}
     write_json(options.out / "benchmark.json", kept | {"groups": groups})

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import zipfile
 from concurrent.futures import ProcessPoolExecutor
+from itertools import permutations
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -96,7 +97,7 @@ def fetch(out: Path, deb: Path | None) -> Path:
 def catalogue(unpacked: Path) -> list[dict]:
     rows = []
     for library in sorted(LICENCES):
-        entries: dict[int, dict[str, str]] = {}
+        entries = {}
         text = (unpacked / library / "PluginFurnitureCatalog.properties").read_text(
             encoding="latin1"
         )
@@ -124,9 +125,8 @@ def catalogue(unpacked: Path) -> list[dict]:
 
 
 def kind_of(name: str) -> str | None:
-    return next(
-        (kind for kind, pattern in KINDS.items() if re.fullmatch(pattern, name.lower())), None
-    )
+    fitting = (kind for kind, pattern in KINDS.items() if re.fullmatch(pattern, name.lower()))
+    return next(fitting, None)
 
 
 def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
@@ -169,14 +169,9 @@ def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
 def candidate_rotations() -> np.ndarray:
     """(32, 3, 3) possible symmetries: the 24 rotations of a cube, identity first, and steps of 30
     degrees about z."""
-    signs = [
-        np.diag(s)
-        for s in np.array(np.meshgrid([1, -1], [1, -1], [1, -1])).reshape(3, -1).T.astype(float)
-    ]
-    orders = [
-        np.eye(3)[list(p)]
-        for p in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
-    ]
+    x, y, z = np.meshgrid([1.0, -1.0], [1.0, -1.0], [1.0, -1.0])
+    signs = [np.diag(s) for s in np.stack([x, y, z], axis=-1).reshape(-1, 3)]
+    orders = [np.eye(3)[list(order)] for order in permutations(range(3))]
     cube = [s @ o for o in orders for s in signs if np.linalg.det(s @ o) > 0]
     cube.sort(key=lambda R: -np.trace(R))
     about_z = Rotation.from_euler(
@@ -188,11 +183,8 @@ def candidate_rotations() -> np.ndarray:
 def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
     """20,000 points of the surface relative to the centre of its box, in radii, and their colours
     in [0, 1]."""
-    corners = model.triangles.reshape(-1, 3)
-    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(model.triangles), process=False)
     points, face = trimesh.sample.sample_surface(mesh, 20_000, seed=0)
-    points = np.asarray(points)
-    face = np.asarray(face)
     weights = trimesh.triangles.points_to_barycentric(model.triangles[face], points)
     uv = np.einsum("ij,ijk->ik", weights, model.uv[face])
     colours = np.empty((len(points), 3))
@@ -202,45 +194,43 @@ def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
     return (points - model.centre) / model.radius, colours
 
 
+def lie_on(points: np.ndarray, tree: cKDTree) -> bool:
+    """Whether 90 % of points (N, 3) lie within 4 % of the radius of those of the tree."""
+    distances, _ = tree.query(points, distance_upper_bound=0.04)
+    return bool(np.isfinite(distances).mean() >= 0.9)
+
+
 def symmetries(points: np.ndarray, colours: np.ndarray) -> tuple[list[int], list[int]]:
     """Candidate rotations that map the shape to itself, and those that preserve its colours too.
 
-    90 % of the points lie within 4 % of the radius of others, and 90 % have their colour, blurred
-    over 48 neighbours.
+    90 % of the points have the colour of the others, blurred over 48 neighbours.
     """
     tree = cKDTree(points)
     some = slice(None, None, 16)
 
     def fits(R: np.ndarray, part: slice) -> bool:
-        return (
-            float(
-                np.mean(np.isfinite(tree.query(points[part] @ R.T, distance_upper_bound=0.04)[0]))
-            )
-            >= 0.9
-        )
+        return lie_on(points[part] @ R.T, tree)
 
     def blurred(R: np.ndarray) -> np.ndarray:
-        return np.asarray(colours[tree.query(points[some] @ R.T, k=48)[1]].mean(axis=1))
+        _, near = tree.query(points[some] @ R.T, k=48)
+        return colours[near].mean(axis=1)
+
+    def has_other_colours(R: np.ndarray) -> bool:
+        gaps = np.abs(blurred(R) - own).max(axis=1)
+        return bool((gaps > 0.12).mean() >= 0.1)
 
     rotations = candidate_rotations()
     own = blurred(np.eye(3))
-    shape = [
-        k for k, R in enumerate(rotations) if fits(R, slice(None, None, 400)) and fits(R, some)
-    ]
-    same = [
-        k for k in shape if (np.abs(blurred(rotations[k]) - own).max(axis=1) > 0.12).mean() < 0.1
-    ]
-    return shape, same
+    few = slice(None, None, 400)
+    shape = [k for k, R in enumerate(rotations) if fits(R, few) and fits(R, some)]
+    return shape, [k for k in shape if not has_other_colours(rotations[k])]
 
 
 def copy_of(cloud: np.ndarray, others: dict[str, tuple[np.ndarray, cKDTree]]) -> str | None:
-    """Name of the first of the others with the same shape: 90 % of the points within 4 % of the
-    radius."""
+    """Name of the first of the others with the same shape."""
     span = np.ptp(cloud, axis=0)
-    some = cloud[::16]
     for name, (extents, tree) in others.items():
-        near = np.abs(extents - span).max() < 0.03
-        if near and np.isfinite(tree.query(some, distance_upper_bound=0.04)[0]).mean() >= 0.9:
+        if np.abs(extents - span).max() < 0.03 and lie_on(cloud[::16], tree):
             return name
     return None
 
@@ -285,7 +275,7 @@ def main() -> None:
     once = {row["id"]: row for row in reversed(catalogue(unpacked))}  # removes duplicates
     listing = {"package": PACKAGE, "sha256": SHA256, "turns": candidate_rotations().tolist()}
     listing |= {"meshes": [], "left_out": {}}
-    clouds: dict[str, tuple[np.ndarray, cKDTree]] = {}
+    clouds = {}
     for half in ("held-out", "train"):
         tasks = [
             (row, unpacked, arguments.out)

@@ -15,6 +15,7 @@ from scripts.scenes.surfaces import (
     box,
     disc,
     extrude,
+    grid,
     lathe,
     rotation,
     rounded_box,
@@ -249,20 +250,15 @@ def car(rng: Rng) -> Parts:
 
     def across(outline: Array, wide: float) -> Surface:
         y = (outline[:, 0] - 0.5) * length
-        n = len(outline)
         narrow = wide * np.where(outline[:, 1] > middle + 1e-6, rng.uniform(0.7, 0.9), 1.0)
-        points = np.stack([np.stack([s * 0.5 * narrow, y, outline[:, 1]], -1) for s in (-1, 1)])
+        sides = np.stack([np.stack([s * 0.5 * narrow, y, outline[:, 1]], -1) for s in (-1, 1)])
+        shell = grid(sides, caps=False)
+        n = len(outline)
         ring = np.arange(n)
         following = (ring + 1) % n
-        faces = [
-            np.stack([ring, following, following + n], -1),
-            np.stack([ring, following + n, ring + n], -1),
-        ]
-        faces += [
-            np.stack([k * n + ring, k * n + following, np.full(n, 2 * n + k)], -1) for k in (0, 1)
-        ]
-        vertices = np.concatenate([points.reshape(-1, 3), points.mean(axis=1)])
-        return Surface(vertices, np.concatenate(faces))
+        ends = [np.stack([k + ring, k + following, np.full(n, 2 * n + k // n)], -1) for k in (0, n)]
+        vertices = np.concatenate([shell.vertices, sides.mean(axis=1)])
+        return Surface(vertices, np.concatenate([shell.faces, *ends]))
 
     parts.add(across(body, width), 0)
     parts.add(across(cabin, width), 0)
@@ -272,12 +268,12 @@ def car(rng: Rng) -> Parts:
         parts.add(across(glass, width * 1.02), 1)
         wide = 0.66 * width
         for a, b in ((cabin[0], cabin[1]), (cabin[3], cabin[2])):
-            p = a + 0.15 * (b - a)
-            q = a + 0.88 * (b - a)
-            out = np.sign(p[0] - 0.5) * 0.004
+            low_end = a + 0.15 * (b - a)
+            high_end = a + 0.88 * (b - a)
+            out = np.sign(low_end[0] - 0.5) * 0.004
             quad = [
-                (s * 0.5 * wide, (e[0] - 0.5 + out) * length, e[1] + 0.004)
-                for e in (p, q)
+                (s * 0.5 * wide, (end[0] - 0.5 + out) * length, end[1] + 0.004)
+                for end in (low_end, high_end)
                 for s in (-1, 1)
             ]
             parts.add(Surface(np.array(quad), np.array([[0, 1, 3], [0, 3, 2]])), 1)
@@ -285,7 +281,7 @@ def car(rng: Rng) -> Parts:
         floor = rng.uniform(0.5, 0.7) * belt * height
         _add_bed(parts, length, width, boot, (low, floor, tail * height))
     for s in (-1, 1):
-        at = np.array((s * 0.35 * width, -0.5 * length, nose * height - 0.05))
+        at = (s * 0.35 * width, -0.5 * length, nose * height - 0.05)
         lamp = box((0.2 * width, 0.02, 0.06)).moved(at)
         parts.add(lamp, 2)
         parts.add(lamp, 3, (0, length, (tail - nose) * height))

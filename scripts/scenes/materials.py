@@ -11,8 +11,7 @@ def random_colour(rng: Rng) -> Array:
     """(3,) colour in [0, 1]; half of the colours are nearly grey."""
     grey = rng.uniform(0.03, 0.97)
     tint = rng.normal(0, rng.choice([0.03, 0.25]), 3)
-    colour: Array = np.clip(grey + tint, 0.01, 1.0)
-    return colour
+    return np.clip(grey + tint, 0.01, 1.0)
 
 
 class Material:
@@ -39,34 +38,24 @@ class Material:
         along = points @ self._axes + self._phases
         if self._kind == "cells":
             nearest = ((points[:, None] - self._seeds) ** 2).sum(axis=-1).argmin(axis=1)
-            return np.asarray(
-                np.clip(self._first + self._strength * (self._palette[nearest] - self._first), 0, 1)
-            )
+            towards = self._palette[nearest] - self._first
+            return np.clip(self._first + self._strength * towards, 0, 1)
         if self._kind == "waves":
             weight = 0.5 + 0.5 * np.sin(along).mean(axis=1)
         elif self._kind == "stripes":
-            weight = (np.sin(along[:, 0]) > np.sin(self._phases[0])).astype(float)
+            weight = np.sin(along[:, 0]) > np.sin(self._phases[0])
         elif self._kind == "checks":
-            weight = (np.sin(along[:, 0]) * np.sin(along[:, 1]) * np.sin(along[:, 2]) > 0).astype(
-                float
-            )
+            weight = np.sin(along[:, :3]).prod(axis=1) > 0
         elif self._kind == "print":  # lines of dashes, like text
             row = np.floor(along[:, 0])
             place = np.floor(3 * along[:, 1])
             letters = np.sin(12.9898 * row + 78.233 * place) * 43758.5453
-            weight = (
-                (letters - np.floor(letters) > 0.5)
-                & (along[:, 0] - row > 0.4)
-                & (np.sin(7.1 * row) > -0.3)
-            )
+            is_printed = (letters - np.floor(letters) > 0.5) & (np.sin(7.1 * row) > -0.3)
+            weight = is_printed & (along[:, 0] - row > 0.4)
         else:
-            weight = (
-                np.sin(17.0 * along).mean(axis=1) * np.sin(31.0 * along[:, ::-1]).mean(axis=1) + 0.5
-            )
-        blend: Array = (
-            self._strength * np.asarray(weight, dtype=float)[:, None] * (self._second - self._first)
-        )
-        return self._first + blend
+            coarse = np.sin(17.0 * along).mean(axis=1)
+            weight = coarse * np.sin(31.0 * along[:, ::-1]).mean(axis=1) + 0.5
+        return self._first + self._strength * weight[:, None] * (self._second - self._first)
 
 
 def random_picture(rng: Rng, size: int) -> Array:
@@ -77,9 +66,7 @@ def random_picture(rng: Rng, size: int) -> Array:
     if rng.random() < 0.4:
         bottom = np.clip(top + rng.normal(0, 0.1, 3), 0, 1)
     ramp = np.linspace(0, 1, size)[:, None, None]
-    picture: Array = np.broadcast_to(top + ramp * (bottom - top), (size, size, 3)).astype(
-        np.float32
-    )
+    picture = np.broadcast_to(top + ramp * (bottom - top), (size, size, 3)).astype(np.float32)
     kind = rng.integers(5)
     if kind in (1, 2):  # clouds or foliage
         noise = np.zeros((size, size, 3), np.float32)

@@ -17,7 +17,7 @@ from curvireg_torch.geometry.cameras import rotation_towards
 from curvireg_torch.geometry.framing import outside_fraction
 from scripts.scenes.light import Light, random_light
 from scripts.scenes.materials import random_picture, random_rotation
-from scripts.scenes.surfaces import Array, Rng
+from scripts.scenes.surfaces import Array, Rng, rotation, unit_circle
 from scripts.scenes.textured import Picture, Placed, Texture, TexturedMesh, render
 
 Draw: TypeAlias = Callable[[Rng], TexturedMesh]
@@ -40,6 +40,10 @@ class Scene:
     background: Array
     views: list[View]
 
+    @property
+    def annotated(self) -> list[Placed]:
+        return [shape for shape in self.shapes if shape.obj_id is not None]
+
     def render(self, view: View, size: tuple[int, int]) -> Picture:
         """Render one view at ``size`` (H, W)."""
         R, t, K = view
@@ -60,25 +64,27 @@ def single(
 ) -> Scene:
     """One object of radius 1 on the floor of a room, with up to five others around it, and one in
     front of it."""
-    rotation = np.eye(3) if upright else random_rotation(rng)
-    target = Placed.standing(mesh, rotation, 1.0 / mesh.radius, obj_id=obj_id)
+    turn = np.eye(3) if upright else random_rotation(rng)
+    target = Placed.standing(mesh, turn, 1.0 / mesh.radius, obj_id=obj_id)
     fill = rng.uniform(0.25, 0.65) * min(size)
     elevation = float(rng.choice([rng.uniform(-4, 25), rng.uniform(5, 60)]))
-    R, t, K = look_at(
-        target.hull, size, rng, fill=fill, azimuth=rng.uniform(0, 360), elevation=elevation
-    )
+    azimuth = rng.uniform(0, 360)
+    view = look_at(target.hull, size, rng, fill=fill, azimuth=azimuth, elevation=elevation)
+    R, t, _ = view
     eye = -R.T @ t
     shapes = [target]
     if eye[2] > 0.05 and rng.random() < 0.9:
         shapes += _room(textures, eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9), rng)
     reach = float(np.linalg.norm(target.hull[:, :2], axis=1).max())
     shapes += _clutter(clutter, 0.8 * reach, eye, int(rng.choice([0, 1, 3, 5])), occluded, rng)
-    return Scene(
-        shapes,
-        random_light(rng),
-        random_picture(rng, 512),
-        _rig((R, t, K), target.hull, cameras, rng),
-    )
+    return _lit(shapes, view, target.hull, cameras, rng)
+
+
+def _lit(shapes: list[Placed], view: View, points: Array, cameras: int, rng: Rng) -> Scene:
+    """The scene of shapes under a random light, seen by a rig that looks at points (P, 3)."""
+    light = random_light(rng)
+    background = random_picture(rng, 512)
+    return Scene(shapes, light, background, _rig(view, points, cameras, rng))
 
 
 def shelf(
@@ -95,54 +101,44 @@ def shelf(
     unit = float(np.mean([mesh.radius for _, mesh in meshes]))
     boards = 1 if len(meshes) < 10 or rng.random() < 0.3 else 2
     share = np.array_split(rng.permutation(len(meshes)), boards)
-    shapes: list[Placed] = []
+    shapes = []
     board_height = 0.0
     for members in share:
-        x = 0.0
         edge = [0.0, 0.0]
         tallest = 0.0
         for n, k in enumerate(members):
             obj_id, mesh = meshes[int(k)]
             row = n % 2  # front, back
-            angle = np.radians(rng.normal(0, 35))
-            turn = np.array(
-                [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-            )
+            turn = rotation(2, np.radians(rng.normal(0, 35)))
             item = Placed.standing(mesh, turn, 1.0 / unit, obj_id=obj_id)
             low = item.hull.min(axis=0)
             high = item.hull.max(axis=0)
-            x = (
-                edge[row]
-                + 0.5 * (high - low)[0]
-                + rng.uniform(0.02, 0.2 + 1.2 * (1.0 - occlusion) * (1 - row))
-            )
+            half = 0.5 * (high - low)[0]
+            gap = rng.uniform(0.02, 0.2 + 1.2 * (1.0 - occlusion) * (1 - row))
+            x = edge[row] + half + gap
             y = 1.6 * row + rng.uniform(-0.15, 0.15)
-            edge[row] = x + 0.5 * (high - low)[0]
+            edge[row] = x + half
             tallest = max(tallest, high[2])
-            shapes.append(
-                Placed.standing(mesh, turn, 1.0 / unit, (x, y, board_height), obj_id=obj_id)
-            )
+            at = (x, y, board_height)
+            shapes.append(Placed.standing(mesh, turn, 1.0 / unit, at, obj_id=obj_id))
         board_height += tallest + rng.uniform(0.3, 0.8)
     points = np.concatenate([shape.hull for shape in shapes])
     (x0, _, _), (x1, _, top) = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
     wood = Texture(textures(rng))
+    front = -1.2
+    back = 3.0
     for z in sorted({round(float(shape.hull[:, 2].min()), 6) for shape in shapes}):
-        shapes.append(_quad([(x0, -1.2, z), (x1, -1.2, z), (x1, 3.0, z), (x0, 3.0, z)], wood))
-        shapes.append(
-            _quad([(x0, -1.2, z - 0.12), (x1, -1.2, z - 0.12), (x1, -1.2, z), (x0, -1.2, z)], wood)
-        )
-    shapes.append(
-        _quad(
-            [(x0, 3.0, -1), (x1, 3.0, -1), (x1, 3.0, top), (x0, 3.0, top)], Texture(textures(rng))
-        )
-    )
+        board = [(x0, front, z), (x1, front, z), (x1, back, z), (x0, back, z)]
+        low = z - 0.12
+        edge_of_board = [(x0, front, low), (x1, front, low), (x1, front, z), (x0, front, z)]
+        shapes += [_quad(board, wood), _quad(edge_of_board, wood)]
+    wall = [(x0, back, -1), (x1, back, -1), (x1, back, top), (x0, back, top)]
+    shapes.append(_quad(wall, Texture(textures(rng))))
     fill = rng.uniform(0.7, 1.0) * max(size)
-    view = look_at(
-        points, size, rng, fill=fill, azimuth=rng.normal(0, 18), elevation=rng.uniform(0, 25)
-    )
-    return Scene(
-        shapes, random_light(rng), random_picture(rng, 512), _rig(view, points, cameras, rng)
-    )
+    azimuth = rng.normal(0, 18)
+    elevation = rng.uniform(0, 25)
+    view = look_at(points, size, rng, fill=fill, azimuth=azimuth, elevation=elevation)
+    return _lit(shapes, view, points, cameras, rng)
 
 
 def look_at(
@@ -199,7 +195,7 @@ def cut(view: View, points: Array, size: tuple[int, int], fraction: float, rng: 
 def _turn_to(ray: Array, target: Array) -> Array:
     """(3, 3) rotation from one ray to another."""
     first, second = (rotation_towards(torch.from_numpy(one)).numpy() for one in (ray, target))
-    return np.asarray(second @ first.T)
+    return second @ first.T
 
 
 def _rig(view: View, points: Array, cameras: int, rng: Rng) -> list[View]:
@@ -212,9 +208,8 @@ def _rig(view: View, points: Array, cameras: int, rng: Rng) -> list[View]:
     for k in range(1, cameras):
         side = k % 2
         angle[side] += rng.uniform(*RIG_STEP)
-        turn = _rotation(
-            np.array([rng.normal(0, 3), rng.normal(0, 3), (1 - 2 * side) * angle[side]])
-        )
+        tilt = rng.normal(0, 3, 2)
+        turn = _rotation(np.array([*tilt, (1 - 2 * side) * angle[side]]))
         place = (R @ middle + t) * rng.uniform(0.85, 1.15)
         views.append((R @ turn, place - R @ turn @ middle, K))
     return views
@@ -248,18 +243,17 @@ def camera_path(view: View, middle: Array, count: int, rng: Rng) -> list[View]:
         velocity *= min(1.0, 0.98 * MAX_TURN / max(turn, 1e-9), 0.98 * MAX_SHIFT / max(shift, 1e-9))
         state = state + velocity
         path.append(pose(state))
-    return [(rotation, place - rotation @ middle, K) for rotation, place in path]
+    return [(turn, place - turn @ middle, K) for turn, place in path]
 
 
 def _rotation(degrees: Array) -> Array:
-    return np.asarray(rotation_from_axis_angle(torch.from_numpy(np.radians(degrees))))
+    return rotation_from_axis_angle(torch.from_numpy(np.radians(degrees))).numpy()
 
 
 def _quad(corners: list[tuple[float, ...]], paint: Texture, repeats: float = 1.0) -> Placed:
     uv = repeats * np.array([(0, 0), (1, 0), (1, 1), (0, 1.0)])
-    mesh = TexturedMesh.from_arrays(
-        np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]), [paint], uv=uv
-    )
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    mesh = TexturedMesh.from_arrays(np.array(corners), faces, [paint], uv=uv)
     return Placed(mesh, np.eye(3), np.zeros(3))
 
 
@@ -292,20 +286,17 @@ def _clutter(
         mesh = draw(rng)
         front = k >= count
         scale = float(np.exp(rng.uniform(-0.9, 0.4))) * (0.6 if front else 1.0) / mesh.radius
-        angle = rng.uniform(0, 360)
-        turn = (
-            random_rotation(rng) if rng.random() < 0.15 else _rotation(np.array([0.0, 0.0, angle]))
-        )
+        turn = _rotation(np.array([0.0, 0.0, rng.uniform(0, 360)]))
+        if rng.random() < 0.15:
+            turn = random_rotation(rng)
         radius = 0.5 * scale * float(np.linalg.norm(np.ptp(mesh.hull, axis=0)[:2]))
         if front:
             direction = eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9)
             aside = np.array([-direction[1], direction[0]]) * rng.uniform(-0.8, 0.8)
             place = direction * (reach + radius + rng.uniform(0.05, 0.4)) + aside
         else:
-            angle = rng.uniform(0, 2 * np.pi)
-            place = np.array([np.cos(angle), np.sin(angle)]) * (
-                reach + radius + rng.exponential(0.7)
-            )
+            direction = unit_circle(rng.uniform(0, 2 * np.pi))
+            place = direction * (reach + radius + rng.exponential(0.7))
         # not around the camera
         if np.linalg.norm(eye[:2] - place) > radius + (0.6 if front else 1.0):
             clutter.append(Placed.standing(mesh, turn, scale, (*place, 0.0)))
@@ -334,13 +325,13 @@ def simulate_camera(picture: Array, rng: Rng) -> Array:
         picture = cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
     if rng.random() < 0.35:  # low resolution
         scale = rng.uniform(0.35, 0.9)
-        few = cv2.resize(
-            picture, (int(width * scale), int(height * scale)), interpolation=cv2.INTER_AREA
-        )
-        picture = cv2.resize(few, (width, height))
+        size = (int(width * scale), int(height * scale))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        picture = cv2.resize(picture, (width, height))
     picture = picture + rng.normal(0, np.exp(rng.uniform(-6.5, -3.0)), picture.shape)
-    coded: Array = (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)
+    coded = (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)
     if rng.random() < 0.6:
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(30, 96))]
-        coded = np.asarray(cv2.imdecode(cv2.imencode(".jpg", coded, quality)[1], cv2.IMREAD_COLOR))
+        _, data = cv2.imencode(".jpg", coded, quality)
+        coded = cv2.imdecode(data, cv2.IMREAD_COLOR)
     return coded

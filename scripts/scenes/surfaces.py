@@ -31,8 +31,8 @@ class Parts:
     """Surfaces with material numbers; parts with the same number have the same material."""
 
     def __init__(self) -> None:
-        self.surfaces: list[Surface] = []
-        self.materials: list[Array] = []
+        self.surfaces = []
+        self.materials = []
 
     def add(
         self,
@@ -65,18 +65,18 @@ def unit_circle(angles: Array) -> Array:
     return np.stack([np.cos(angles), np.sin(angles)], -1)
 
 
-def _grid(points: Array, *, close: bool = True, caps: bool = True) -> Surface:
-    """Triangles between the rows of (M, N, 3) points; ``close`` closes each row, ``caps`` the
+def grid(points: Array, *, caps: bool = True) -> Surface:
+    """Triangles between the rows of (M, N, 3) points, which are closed; ``caps`` closes the
     ends."""
     m, n = points.shape[:2]
-    i, j = np.meshgrid(np.arange(m - 1), np.arange(n if close else n - 1), indexing="ij")
+    i, j = np.mgrid[: m - 1, :n]
     a = i * n + j
     b = i * n + (j + 1) % n
     c = a + n
     d = b + n
     faces = [np.stack(corners, -1).reshape(-1, 3) for corners in ((a, b, d), (a, d, c))]
     vertices = points.reshape(-1, 3)
-    if caps and close:
+    if caps:
         ring = np.arange(n)
         last = (m - 1) * n
         following = (ring + 1) % n
@@ -93,7 +93,7 @@ def _circle(n: int = AROUND) -> Array:
 def loft(outlines: Array, heights: ArrayLike) -> Surface:
     """Closed surface through (M, N, 2) outlines at (M,) heights along z."""
     z = np.broadcast_to(np.asarray(heights, dtype=float)[:, None, None], (*outlines.shape[:2], 1))
-    return _grid(np.concatenate([outlines, z], -1))
+    return grid(np.concatenate([outlines, z], -1))
 
 
 def box(size: ArrayLike, *, top: float = 1.0) -> Surface:
@@ -131,10 +131,9 @@ def superquadric(size: ArrayLike, roundness: tuple[float, float]) -> Surface:
     v = np.linspace(-0.5, 0.5, AROUND // 2 + 1) * np.pi
     ring = _power(_circle(), roundness[1])
     level = _power(unit_circle(v), roundness[0])
-    points = np.concatenate(
-        [level[:, :1, None] * ring, np.broadcast_to(level[:, 1:, None], (len(v), AROUND, 1))], -1
-    )
-    return Surface(*_grid(points, caps=False)).moved(scale=size)
+    height = np.broadcast_to(level[:, 1:, None], (len(v), AROUND, 1))
+    points = np.concatenate([level[:, :1, None] * ring, height], -1)
+    return grid(points, caps=False).moved(scale=size)
 
 
 def _power(x: Array, exponent: float) -> Array:
@@ -144,14 +143,11 @@ def _power(x: Array, exponent: float) -> Array:
 def torus(radius: float, thickness: float) -> Surface:
     """Ring of ``radius`` about z."""
     around = _circle()
-    section = thickness * _circle(10)
     around = np.concatenate([around, around[:1]])
-    reach = radius + section[:, 0]
-    flat = around[:, None] * reach[None, :, None]
-    return _grid(
-        np.concatenate([flat, np.broadcast_to(section[None, :, 1:], (*flat.shape[:2], 1))], -1),
-        caps=False,
-    )
+    section = thickness * _circle(10)
+    flat = around[:, None] * (radius + section[:, :1])
+    height = np.broadcast_to(section[:, 1:], (*flat.shape[:2], 1))
+    return grid(np.concatenate([flat, height], -1), caps=False)
 
 
 def bar(start: ArrayLike, end: ArrayLike, radius: float, *, sides: int = 10) -> Surface:
@@ -163,7 +159,7 @@ def bar(start: ArrayLike, end: ArrayLike, radius: float, *, sides: int = 10) -> 
     side /= np.linalg.norm(side)
     frame = np.stack([side, np.cross(axis, side)])
     ring = radius * unit_circle(2 * np.pi * (np.arange(sides) + 0.5) / sides) @ frame
-    return _grid(np.stack([a + ring, b + ring]))
+    return grid(np.stack([a + ring, b + ring]))
 
 
 def tube(path: Array, radius: float) -> Surface:
@@ -173,8 +169,11 @@ def tube(path: Array, radius: float) -> Surface:
 
 def join(surfaces: list[Surface]) -> Surface:
     """One surface of several."""
-    first = np.cumsum([0] + [len(s.vertices) for s in surfaces[:-1]])
-    return Surface(
-        np.concatenate([s.vertices for s in surfaces]),
-        np.concatenate([s.faces + k for s, k in zip(surfaces, first, strict=True)]),
-    )
+    vertices = []
+    faces = []
+    count = 0
+    for surface in surfaces:
+        vertices.append(surface.vertices)
+        faces.append(surface.faces + count)
+        count += len(surface.vertices)
+    return Surface(np.concatenate(vertices), np.concatenate(faces))

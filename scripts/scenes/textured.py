@@ -12,7 +12,8 @@ from scipy.spatial import ConvexHull
 
 from curvireg_torch.rendering.embree import RayScene
 from scripts.scenes.light import Light, shade_points
-from scripts.scenes.surfaces import Array
+from scripts.scenes.materials import random_colour
+from scripts.scenes.surfaces import Array, Rng
 
 # px, longer side of textures: finer ones would only alias in pictures of this size
 MAX_TEXTURE = 512
@@ -53,6 +54,11 @@ class Texture:
             xy = np.stack([x, y], 1)[k : k + size, None].astype(np.float32) + 0.5
             out[k : k + size] = cv2.remap(padded, xy, None, cv2.INTER_LINEAR)[:, 0]
         return out
+
+
+def plain_texture(rng: Rng) -> Texture:
+    """A random uniform colour."""
+    return Texture(random_colour(rng)[None, None].astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -99,8 +105,8 @@ class TexturedMesh:
             warnings.simplefilter("ignore", RuntimeWarning)  # faces without texture coordinates
             loaded = trimesh.load(path, process=False)
         parts = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
-        columns: tuple[list[Array], ...] = ([], [], [], [])
-        paints: list[Texture] = []
+        columns = ([], [], [], [])
+        paints = []
         for number, part in enumerate(
             p for p in parts if isinstance(p, trimesh.Trimesh) and len(p.faces)
         ):

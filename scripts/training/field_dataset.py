@@ -71,8 +71,7 @@ def mirrored_descriptors(descriptors: Tensor) -> Tensor:
     """
     blocks = SETTINGS.grid - SETTINGS.block + 1
     layout = (blocks, blocks, SETTINGS.block, SETTINGS.block, SETTINGS.bins)
-    mirrored: Tensor = descriptors.unflatten(-1, layout).flip((-4, -2, -1)).flatten(-5)
-    return mirrored
+    return descriptors.unflatten(-1, layout).flip((-4, -2, -1)).flatten(-5)
 
 
 def _view_rotations(generator: torch.Generator) -> Tensor:
@@ -92,7 +91,7 @@ class ReplayBuffer:
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self.added = 0
-        self._store: dict[str, Tensor] = {}
+        self._store = {}
 
     def add(self, batch: dict[str, Tensor]) -> None:
         """Store a batch, in place of the oldest samples when the buffer is full."""

@@ -120,7 +120,7 @@ def main() -> None:
     loader = iter(DataLoader(FieldDataset(generated), options.fresh, **workers))
     replay = ReplayBuffer(options.replay)
     generator = torch.Generator().manual_seed(options.seed)
-    totals: dict[str, float] = {}
+    totals = {}
     start = time.monotonic()
     spent = 0.0
     validated = 0.0

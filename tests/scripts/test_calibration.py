@@ -10,7 +10,7 @@ pytest.importorskip("sklearn")
 
 from curvireg_torch.geometry.framing import outside_fraction
 from curvireg_torch.synthetic import example_mesh
-from scripts.benchmark.make import TWIN, Shapes, Tied, Twins
+from scripts.benchmark.make import TWIN, Packages, Shapes, Tied
 from scripts.calibration import fits, measure, sets
 from scripts.calibration.calibrate import covariance_quality
 from scripts.scenes.scene import cut, look_at
@@ -76,7 +76,7 @@ def test_sets_of_furniture_are_left_out_where_there_is_none(tmp_path):
 
 
 def test_twins_have_the_same_shape_and_another_print():
-    twins = Twins(options(cad="print"))
+    twins = Packages(options(cad="print"))
     one = twins.mesh(1)
     other = twins.mesh(1 + TWIN)
     assert np.array_equal(one.triangles, other.triangles)
