@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from kornia.feature import gftt_response, harris_response
+from kornia.filters import spatial_gradient
 from torch import Tensor
 
 from curvireg_torch.errors import MissingDependencyError
@@ -29,7 +30,6 @@ from curvireg_torch.filters.operations import (
     at_least_float32,
     central_derivatives,
     image_maximum,
-    replicate_pad,
     smooth,
     to_grey,
 )
@@ -60,21 +60,10 @@ def peaks(response: Tensor, fraction: float) -> Tensor:
     return strongest_points(response, largest & (response > 0), fraction)
 
 
-def sobel_gradient(image: Tensor) -> Tensor:
-    """(B, 2, H, W) gradient of (B, 1, H, W) by the Sobel kernels, per px (their sums divided by
-    8)."""
-    p = replicate_pad(image, 1)
-    along_x = p[..., 2:] - p[..., :-2]
-    along_y = p[..., 2:, :] - p[..., :-2, :]
-    gx = along_x[..., :-2, :] + 2.0 * along_x[..., 1:-1, :] + along_x[..., 2:, :]
-    gy = along_y[..., :-2] + 2.0 * along_y[..., 1:-1] + along_y[..., 2:]
-    return torch.cat([gx, gy], dim=1) / 8.0
-
-
 @detector
 def sobel(image: Tensor, *, fraction: float = 0.04) -> Tensor:
-    """Gradient by the Sobel kernels per px, borders replicated."""
-    return field_points(sobel_gradient(image), fraction=fraction)
+    """Gradient by the Sobel kernels per px (their sums divided by 8), borders replicated."""
+    return field_points(spatial_gradient(image)[:, 0], fraction=fraction)
 
 
 @detector
@@ -99,9 +88,8 @@ def laplacian_of_gaussian(image: Tensor, *, fraction: float = 0.04) -> Tensor:
 def canny(image: Tensor, *, fraction: float = 0.04) -> Tensor:
     """Canny (1986) by scikit-image, sigma 1.4 px; as in MATLAB's ``edge``, 30 % of the pixels
     exceed the upper threshold, and the lower one is 0.4 times as high."""
-    response = torch.linalg.vector_norm(
-        sobel_gradient(smooth(image, 1.4, margin=0)), dim=1, keepdim=True
-    )
+    gradient = spatial_gradient(smooth(image, 1.4, margin=0))[:, 0]
+    response = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
     points = torch.zeros_like(response, dtype=torch.bool)
     for grey, length, mask in zip(
         image.double().numpy()[:, 0], response[:, 0], points[:, 0], strict=True

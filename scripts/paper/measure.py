@@ -22,7 +22,12 @@ from curvireg_torch.filters import (
     MultiScaleFocusCurves,
 )
 from curvireg_torch.filters.focus import PAPER_THRESHOLD
-from curvireg_torch.geometry import pose_from_box, rotation_error, viewpoint_from_rotation
+from curvireg_torch.geometry import (
+    pose_from_box,
+    rotation_error,
+    rotation_from_axis_angle,
+    viewpoint_from_rotation,
+)
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.matching.search import BEST_VIEWS, coherent_of, different_views, refine, search
 from curvireg_torch.mesh import Mesh, load_mesh
@@ -94,7 +99,7 @@ class Remembered:
     def __init__(self, mesh: Mesh) -> None:
         self._inner = ViewDescriber(mesh, BankSettings()).view_renderer
         self.name = self._inner.name
-        self._known: dict[bytes, Tensor] = {}
+        self._known = {}
 
     def render(
         self,
@@ -146,7 +151,7 @@ def _points_of(
     views = {name: field_points(field, fraction=share)[0, 0] for name, field in fields.items()}
     photos = {name: detect(crop) for name, detect in detectors_of(share).items()}
     view = views["CS"]
-    record: Record = {
+    record = {
         "ip": {name: float(intersection_percentage(photo, view)) for name, photo in photos.items()},
         "hausdorff": {
             name: float(hausdorff_distance(photo, view)) for name, photo in photos.items()
@@ -183,11 +188,9 @@ def _points_of(
 
 def _turns_about_z() -> Tensor:
     """(40, 3, 3) rotations of the object about its z axis."""
-    angles = torch.deg2rad(torch.tensor(CURVE_OFFSETS, dtype=torch.float64))
-    zero = torch.zeros_like(angles)
-    one = torch.ones_like(angles)
-    rows = [angles.cos(), -angles.sin(), zero, angles.sin(), angles.cos(), zero, zero, zero, one]
-    return torch.stack(rows, dim=1).view(-1, 3, 3)
+    turns = torch.zeros(len(CURVE_OFFSETS), 3, dtype=torch.float64)
+    turns[:, 2] = torch.deg2rad(torch.tensor(CURVE_OFFSETS))
+    return rotation_from_axis_angle(turns)
 
 
 @torch.no_grad()
@@ -195,12 +198,12 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
     """Rankings of all views, and the poses that the paper's search finds, for each pair of
     filters."""
     mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
-    renderer: Any = Remembered(mesh)
+    renderer = Remembered(mesh)
     describe = ViewDescriber(mesh, settings)
     crops = torch.cat([case.crop(settings) for case in cases])
     truths = torch.stack([case.view(mesh)[0] for case in cases])
-    records: list[Record] = [{} for _ in cases]
-    banks: dict[tuple[ViewPolicy, BankSettings], ViewBank] = {}
+    records = [{} for _ in cases]
+    banks = {}
 
     def bank_of(pipeline: Pipeline) -> ViewBank:
         """Variants that differ in their terms share views."""
@@ -268,7 +271,7 @@ def _ranked(
     rotation, _ = search(matcher, query, ranking)
     retrieved = top[:BEST_VIEWS]
     closest = retrieved[errors[retrieved].argmin()]
-    record: Record = {
+    record = {
         "top": errors[top].tolist(),
         "est": _pose_errors(rotation, case, truth, describe),
         "found": float(rotation_error(truth, rotation)),
@@ -311,7 +314,7 @@ def measure_focus(cases: list[Case], settings: BankSettings, pose: str) -> list[
     matcher = ViewMatcher(bank, pipeline=pipeline)
     rotations = bank.rotations.double()
     azimuths = torch.stack([viewpoint_from_rotation(R)[0] for R in rotations])
-    records: list[Record] = []
+    records = []
     for k in range(0, len(cases), FOCUS_BATCH):
         records += _focus_of(cases[k : k + FOCUS_BATCH], mesh, matcher, rotations, azimuths)
     return records
@@ -328,10 +331,10 @@ def _focus_of(
     fraction = matcher.bank.settings.point_fraction
     crops = torch.cat([case.crop(matcher.bank.settings) for case in cases])
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-    views: list[Tensor] = []
-    errors: list[dict[str, Tensor]] = []
-    near: list[Tensor] = []
-    records: list[Record] = []
+    views = []
+    errors = []
+    near = []
+    records = []
     for case in cases:
         R, distance = case.view(mesh)
         field = matcher.describer.fields(R[None], torch.tensor([distance]).double())

@@ -78,7 +78,7 @@ def _distances(a: Mask, b: Mask) -> NDArray[np.float64]:
     empty."""
     if not b.any():
         return np.full(int(a.sum()), np.inf)
-    to_b: NDArray[np.float64] = distance_transform_edt(~b)
+    to_b = distance_transform_edt(~b)
     return to_b[a]
 
 

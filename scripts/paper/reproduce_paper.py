@@ -27,54 +27,72 @@ records are there. --page writes all tables that DIR holds, with the commit, int
 """
 
 import argparse
-import hashlib
 import json
+import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+from tqdm import tqdm
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
 sys.path.insert(0, str(REPOSITORY))
 
-from curvireg_torch.errors import CurviregError, InvalidInputError, MissingDependencyError
+from curvireg_torch.errors import (
+    CurviregError,
+    InvalidInputError,
+    MissingDependencyError,
+    WorkerError,
+)
 from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.jobs.runner import results_digest
+from curvireg_torch.jobs.store import finite
 from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.utils.executors import Workers
 from curvireg_torch.utils.files import file_digest, text_digest, write_file
-from scripts._shared import commit
+from scripts._shared import commit, parser_of, read_json, update_page, write_json
 from scripts.paper import tables as paper
 from scripts.paper.cases import Case, by_mesh, find_cases
-from scripts.paper.parts import Part, complete, read
 
-OF_POINTS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
-    "detectors": paper.detector_tables,
-    "repeatability": paper.repeatability_tables,
-    "curve": paper.curve_tables,
-    "sensitivity": paper.sensitivity_tables,
+PHASES: dict[str, dict[str, Callable[[paper.Records], list[paper.Table]]]] = {
+    "focus": {"focus": paper.focus_tables},
+    "points": {
+        "detectors": paper.detector_tables,
+        "repeatability": paper.repeatability_tables,
+        "curve": paper.curve_tables,
+        "sensitivity": paper.sensitivity_tables,
+    },
+    "views": {
+        "precision": paper.precision_tables,
+        "ranks": paper.rank_tables,
+        "angles": paper.angle_tables,
+        "grids": paper.grid_tables,
+        "search": paper.search_tables,
+    },
 }
-OF_VIEWS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
-    "precision": paper.precision_tables,
-    "ranks": paper.rank_tables,
-    "angles": paper.angle_tables,
-    "grids": paper.grid_tables,
-    "search": paper.search_tables,
-}
-OF_FOCUS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {"focus": paper.focus_tables}
-TABLES = (*OF_FOCUS, *OF_POINTS, *OF_VIEWS)
+"""What is measured together, and the tables that are made of it."""
+
+TABLES = [name for makers in PHASES.values() for name in makers]
 ON_PAGE = ("detectors", "ip_classes", "sensitivity", "repeatability", "curve", "precision")
 ON_PAGE += ("precision_classes", "ranks", "grids", "angles", "search")
-OF_FOCUS_PAGE = ("protocols", "thresholds")
-BLOCKS = {"protocols": OF_FOCUS_PAGE, "paper": ON_PAGE}
+BLOCKS = {"protocols": ("protocols", "thresholds"), "paper": ON_PAGE}
 """Tables between each pair of markers of the page; one that a folder has none of stays."""
 
-PHASES = {"focus": OF_FOCUS, "points": OF_POINTS, "views": OF_VIEWS}
+CURVE = "paper-curve.webp"
+
+
+def measure_groups(
+    state: tuple[str, BankSettings, str], tasks: Sequence[tuple[Path, list[Case]]]
+) -> list[list[dict[str, Any]]]:
+    """Records of the cases of each mesh."""
+    return [measure(cases, *state) for _, cases in tasks]
 
 
 def measure(
-    phase: str, cases: list[Case], settings: BankSettings, pose: str
+    cases: list[Case], phase: str, settings: BankSettings, pose: str
 ) -> list[dict[str, Any]]:
     """Records of the cases of one mesh."""
     from scripts.paper.measure import measure_focus, measure_points, measure_views
@@ -115,7 +133,7 @@ def run(arguments: argparse.Namespace) -> None:
                 write_file(arguments.out / f"{table.name}.md", text.encode())
                 print(text, flush=True)
             if name == "curve":
-                draw_curve(records, arguments.out / "curve.png")
+                draw_curve(paper.Records(records, what), arguments.out / CURVE)
     if arguments.page is not None:
         write_page(arguments.out, arguments.page)
 
@@ -124,38 +142,44 @@ def collect(
     phase: str, cases: list[Case], settings: BankSettings, pose: str, arguments: argparse.Namespace
 ) -> list[dict[str, Any]]:
     """The records of all cases; those of each mesh are stored when they are known."""
-    code = results_digest() + own_digest()
     # In a fixed random order: the part that an interrupted run has measured is a fair one.
     groups = sorted(
         by_mesh(cases),
         key=lambda group: text_digest(Path(group[0].mesh_path).name + group[0].category),
     )
-    paths = []
-    for group in groups:
-        files = [
-            file_digest(Path(name))
-            for name in (group[0].mesh_path, *(case.image_path for case in group))
-        ]
-        request = json.dumps(
-            [phase, str(settings), pose, code, files, [case.key for case in group]]
-        )
-        paths.append(arguments.out / "records" / f"{phase}-{text_digest(request)}.json")
-    parts = [
-        Part(path, (phase, group, settings, pose), len(group))
-        for path, group in zip(paths, groups, strict=True)
+    folder = arguments.out / "records"
+    paths = [
+        folder / f"{phase}-{request_of(phase, group, settings, pose)}.json" for group in groups
     ]
-    if arguments.partial:
-        parts = [part for part in parts if part.path.exists()]
-    complete(parts, measure, label=phase, jobs=arguments.jobs, quiet=arguments.quiet)
-    return [record for part in parts for record in read(part)]
+    missing = [(p, group) for p, group in zip(paths, groups, strict=True) if not p.exists()]
+    if not arguments.partial:
+        done = len(cases) - sum(len(group) for _, group in missing)
+        bar = tqdm(
+            total=len(cases), initial=done, desc=phase, unit="photo", disable=arguments.quiet
+        )
+        state = (phase, settings, pose)
+        with bar, Workers(arguments.jobs) as workers:
+            for (path, group), found in workers.map(
+                measure_groups, state, ([one] for one in missing)
+            ):
+                if isinstance(found, WorkerError):
+                    raise found
+                write_json(path, finite(found), indent=0)
+                bar.update(len(group))
+    return [record for path in paths if path.exists() for record in read_json(path)]
 
 
-def own_digest() -> str:
-    """Digest of the code that measures."""
-    digest = hashlib.blake2b(digest_size=8)
-    for name in ("cases.py", "detectors.py", "measure.py", "measures.py"):
-        digest.update(Path(__file__).with_name(name).read_bytes())
-    return digest.hexdigest()
+def request_of(phase: str, group: list[Case], settings: BankSettings, pose: str) -> str:
+    """Digest of all that the records of a mesh depend on."""
+    own = [
+        Path(__file__).with_name(name).read_text(encoding="utf-8")
+        for name in ("cases.py", "detectors.py", "measure.py", "measures.py")
+    ]
+    code = results_digest() + text_digest("".join(own))
+    names = (group[0].mesh_path, *(case.image_path for case in group))
+    files = [file_digest(Path(name)) for name in names]
+    keys = [case.key for case in group]
+    return text_digest(json.dumps([phase, str(settings), pose, code, files, keys]))
 
 
 def check_packages() -> None:
@@ -169,64 +193,43 @@ def check_packages() -> None:
             )
 
 
-def draw_curve(records: list[dict[str, Any]], path: Path) -> None:
+def draw_curve(records: paper.Records, path: Path) -> None:
     """Plot the repeatability in 40 views around the true one."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.0, 3.2), dpi=120)
     axes = figure.subplots()
-    every = paper.Records(records, "")
-    for name in records[0]["curve"]:
+    for name in records.records[0]["curve"]:
         means = [
-            every.mean(paper.at("curve", name, k)).mean for k in range(len(paper.CURVE_OFFSETS))
+            records.mean(paper.at("curve", name, k)).mean for k in range(len(paper.CURVE_OFFSETS))
         ]
         axes.plot(paper.CURVE_OFFSETS, means, label=name)
     axes.set_xlabel("degrees about z from the true view")
     axes.set_ylabel("repeatability")
     axes.legend(fontsize=7)
     figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    figure.savefig(path, pil_kwargs={"quality": 80})
 
 
 def write_page(folder: Path, page: Path) -> None:
     """Replace the parts of a page between its markers by the tables of a folder."""
-    from scripts._shared import update_page
-
-    records = [
-        json.loads(path.read_text(encoding="utf-8")) for path in (folder / "records").iterdir()
-    ]
+    records = [read_json(path) for path in (folder / "records").iterdir()]
     commits = sorted({record["commit"] for some in records for record in some})
     for block, names in BLOCKS.items():
-        found = []
-        for name in names:
-            path = folder / f"{name}.md"
-            if path.exists():
-                found.append(path.read_text(encoding="utf-8"))
-            if name == "curve" and (folder / "curve.png").exists():
-                found.append(
-                    f"![Repeatability in 40 views around the true one]({_picture(folder, page)})\n"
-                )
+        paths = [folder / f"{name}.md" for name in names]
+        found = [path.read_text(encoding="utf-8") for path in paths if path.exists()]
+        if "curve" in names and (folder / CURVE).exists():
+            images = page.parent / "images"
+            images.mkdir(exist_ok=True)
+            shutil.copy(folder / CURVE, images)
+            found.append(f"![Repeatability in 40 views around the true one](images/{CURVE})\n")
         if found:
             lines = [f"Measured at commit {', '.join(commits)}.", "", *found]
             update_page(page, block, "\n".join(lines))
 
 
-def _picture(folder: Path, page: Path) -> str:
-    """The plot of the curve beside a page; returns its path from there."""
-    from PIL import Image
-
-    name = "images/paper-curve.webp"
-    target = page.parent / name
-    target.parent.mkdir(exist_ok=True)
-    Image.open(folder / "curve.png").convert("RGB").save(target, quality=80)
-    return name
-
-
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("table", choices=(*TABLES, "all"), metavar="TABLE")
     parser.add_argument("kind", choices=DATASETS)
     parser.add_argument("root", type=Path, metavar="ROOT")

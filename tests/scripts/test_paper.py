@@ -26,7 +26,7 @@ from scripts._shared import commit, read_json
 from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
-from scripts.paper.measures import bootstrap, points_within
+from scripts.paper.measures import Estimate, bootstrap, points_within
 from tests._support.scenes import write_photo
 
 SETTINGS = BankSettings(image_size=64)
@@ -304,7 +304,7 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     )
     assert run(monkeypatch, *words, "--partial") == 0
     assert run(monkeypatch, "curve", *words[1:]) == 0
-    assert (tmp_path / "curve.png").stat().st_size > 1000
+    assert (tmp_path / reproduce_paper.CURVE).stat().st_size > 1000
     assert "(images/paper-curve.webp)" in page.read_text()
     assert (tmp_path / "images" / "paper-curve.webp").stat().st_size > 1000
     with pytest.raises(AssertionError, match="measured again"):
@@ -349,12 +349,13 @@ def test_the_staircase_leads_from_the_paper_to_the_default_one_change_at_a_time(
 
 
 def test_the_staircase_shows_what_is_known():
-    row = {"set": "lm", "step": "2", "n": "8", "cads": "2", "right": "0.625", "low": "0.5"}
-    row |= {"high": "0.75", "median": "12.3", "commit": "abc"}
-    text = staircase.table([row, {**row, "step": "0", "right": "0", "cads": "3"}])
+    share = Estimate(0.625, 0.5, 0.75, 8)
+    of_two_cads = staircase.Score(share, 2, 12.3)
+    of_three = staircase.Score(share, 3, 12.3)
+    text = staircase.table({"lm": {2: of_two_cads, 0: of_three}})
     assert "| change | `lm`, N 8 |" in text
     assert "| 2. S_rep monotone | 0.62, 12° |" in text
-    assert "| 0. the paper to the letter | 0.00 (0.50 to 0.75), 12° |" in text
+    assert "| 0. the paper to the letter | 0.62 (0.50 to 0.75), 12° |" in text
     assert "| 14. contour fit of five hypotheses: the default | - |" in text
 
 
@@ -363,26 +364,27 @@ def climb(monkeypatch, out, *words):
     return staircase.main()
 
 
-def test_steps_are_evaluated_and_recorded_once(pascal, tmp_path, monkeypatch, capsys):
+def test_steps_are_evaluated_once(pascal, tmp_path, monkeypatch, capsys):
     words = [f"mini={pascal.root}", "--quiet", "--steps", "0"]
     assert climb(monkeypatch, tmp_path, *words) == 0
-    assert "unreadable_image" in capsys.readouterr().err
-    (row,) = staircase.read(tmp_path / "staircase.csv")
-    assert (row["set"], row["step"], row["n"], row["cads"]) == ("mini", "0", "3", "1")
+    output = capsys.readouterr()
+    assert "unreadable_image" in output.err
     summary = read_json(tmp_path / "mini" / "0" / "summary.json")
     assert summary["settings"]["preset"] == "paper"
     aware = summary["symmetry_aware"]
-    assert float(row["right"]) == aware["acc_pi_6"]
-    assert float(row["median"]) == pytest.approx(aware["med_err_deg"])
+    assert "| change | `mini`, N 3 |" in output.out
+    row = f"{aware['acc_pi_6']:.2f}, {aware['med_err_deg']:.0f}°"
+    line = f"| 0. the paper to the letter | {row} |"
+    assert line in output.out
     fail = Mock(side_effect=AssertionError("registered again"))
     with monkeypatch.context() as patch:
         patch.setattr("curvireg_torch.evaluation.datasets.cached_bank", fail)
         assert climb(monkeypatch, tmp_path, *words) == 0
-    assert staircase.read(tmp_path / "staircase.csv") == [row]
+    assert line in capsys.readouterr().out
     assert climb(monkeypatch, tmp_path, "nothing") == 2
 
 
-def test_objects_without_a_pose_count_as_wrong(pascal, tmp_path, monkeypatch):
+def test_objects_without_a_pose_count_as_wrong(pascal, tmp_path, monkeypatch, capsys):
     found = SimpleNamespace(
         errors={
             "a": {"symmetric_error_deg": math.inf, "error_deg": 5.0},
@@ -395,5 +397,6 @@ def test_objects_without_a_pose_count_as_wrong(pascal, tmp_path, monkeypatch):
     monkeypatch.setattr(staircase, "evaluate", lambda *_, **__: {"skipped": {}})
     monkeypatch.setattr(staircase, "read_run", lambda _: found)
     assert climb(monkeypatch, tmp_path, f"mini={pascal.root}", "--steps", "3") == 0
-    (row,) = staircase.read(tmp_path / "staircase.csv")
-    assert (row["n"], row["right"], row["median"]) == ("2", "0.5", "104.5")
+    text = capsys.readouterr().out
+    assert "`mini`, N 2" in text
+    assert "| 0.50, 104° |" in text
