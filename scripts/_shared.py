@@ -88,8 +88,13 @@ def commit(root: Path = REPOSITORY) -> str:
         return "unknown"
 
 
-def processor() -> str:
-    """Name of the processor, as Linux reports it, and the number of its cores."""
+def processor(device: str = "cpu") -> str:
+    """Name of the GPU of a device, or of the processor, as Linux reports it, and the number of its
+    cores."""
+    if device != "cpu":
+        import torch
+
+        return torch.cuda.get_device_name(device)
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -190,7 +190,7 @@ def table(results: Path) -> str:
                     [columns.split(" | "), *(cells(r["name"], r["summary"]) for r in chosen)]
                 )
             )
-            sets: dict[str, list[str]] = {}
+            sets = {}
             for r in chosen:
                 sets.setdefault(note(r), []).append(r["name"])
             notes = "\n".join(

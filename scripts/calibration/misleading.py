@@ -22,8 +22,8 @@ is wrong beyond its tolerance. "ordinary" are photographs with their own camera;
 scripts/results/misleading.json.
 """
 
-import argparse
 import json
+from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,7 @@ from torch import Tensor
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.registration.confidence import RELIABLE
-from scripts._shared import RESULTS, commit, today, write_json
+from scripts._shared import RESULTS, parser_of, read_json, stamp, write_json
 from scripts.benchmark.make import TWIN, Variants
 from scripts.calibration.measure import (
     Row,
@@ -88,7 +88,7 @@ def cases_of(kind: str, sample: Row) -> list[Case]:
         return [cropped(image, box)]
     if kind != "camera":
         return [(kind, image, box, K)]
-    cases: list[Case] = []
+    cases = []
     for size in OTHER_SIZES:
         wrong = torch.diag(K.new_tensor([size, size, 1.0])) @ K
         cases.append((f"size {size:.2f}", image, box, wrong))
@@ -155,7 +155,7 @@ def answer_of(
     S = symmetries_of(sample, registrar)
     R = torch.stack([h.rotation.double() for h in result.hypotheses])
     errors = errors_of(R, sample, S)
-    row: Row = {"verdict": result.verdict, "reliable": result.reliable}
+    row = {"verdict": result.verdict, "reliable": result.reliable}
     row |= {"confidence": result.confidence, "warnings": list(result.warnings)}
     row |= {"degrees": float(errors[0]), "mesh_is_right": result.mesh_index == right_mesh}
     row["distance"] = float(result.distance) / float(true_centre(sample).norm()) - 1.0
@@ -211,8 +211,8 @@ def measure(task: tuple[Path, list[str], list[int]]) -> list[Row]:
 
 def original(folder: Path, obj_id: int) -> Any:
     """The mesh that a photograph shows, of which a variant is annotated."""
-    words = json.loads((folder / "benchmark.json").read_text())
-    options = argparse.Namespace(seed=words["seed"], models=words["models"], cad="exact")
+    words = read_json(folder / "benchmark.json")
+    options = Namespace(seed=words["seed"], models=words["models"], cad="exact")
     shown = Variants(options).mesh(obj_id % TWIN)
     path = folder / "models" / f"shown_{obj_id:06d}.ply"
     shown.save_ply(path)
@@ -224,8 +224,8 @@ def tasks_of(work: Path, name: str, each: int) -> Iterator[tuple[Path, list[str]
     ``each``."""
     folder = work / name
     data = BOPDataset(folder)
-    groups = json.loads((folder / "benchmark.json").read_text())["groups"]
-    by_mesh: dict[int, list[int]] = {}
+    groups = read_json(folder / "benchmark.json")["groups"]
+    by_mesh = {}
     for i in range(len(data)):
         by_mesh.setdefault(int(data.annotation(i)["obj_id"]), []).append(i)
     wanted = -(-each // sum(SOURCES[name][0] in kinds for kinds in SOURCES.values()))
@@ -246,7 +246,7 @@ def table_of(rows: Sequence[Row]) -> Row:
     sure = [row for row in rows if row["reliable"]]
     axes = [row for row in rows if row.get("verdict") == "reliable axis"]
     confident = [row for row in rows if (row.get("confidence") or 0.0) >= RELIABLE]
-    table: Row = {"photographs": len(rows), "confident": len(confident), "reliable": len(sure)}
+    table = {"photographs": len(rows), "confident": len(confident), "reliable": len(sure)}
     table["reliable and wrong"] = sum(row["wrong"] for row in sure)
     table["axis reliable"] = len(axes)
     table["axis reliable and wrong"] = sum(not row["axis"][1] for row in axes)
@@ -254,9 +254,7 @@ def table_of(rows: Sequence[Row]) -> Row:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = parser_of(__doc__)
     parser.add_argument("work", type=Path)
     parser.add_argument("--each", type=int, default=50, help="photographs of each kind")
     parser.add_argument("--sets", nargs="+", choices=SOURCES, default=list(SOURCES))
@@ -271,7 +269,7 @@ def main() -> None:
     rows = measured(out, tasks, measure, options.jobs, "misleading")
     misleading = [row for row in rows if row["kind"] != "ordinary"]
     ways = sorted({(row["kind"], row["way"]) for row in rows})
-    record: Row = {"date": today(), "commit": commit(), "misleading": table_of(misleading)}
+    record = stamp() | {"misleading": table_of(misleading)}
     record["kinds"] = {
         f"{kind}: {way}" if kind == "camera" else kind: table_of(
             [row for row in rows if (row["kind"], row["way"]) == (kind, way)]

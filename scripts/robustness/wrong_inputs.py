@@ -174,7 +174,7 @@ def answer(line: str, folder: Path, expected: str | None) -> dict[str, Any]:
     """
     start = time.perf_counter()
     command = [sys.executable, "-m", "curvireg_torch", *shlex.split(line)]
-    limit: dict[str, Any] = {"timeout": 10 * SECONDS, "preexec_fn": limited}
+    limit = {"timeout": 10 * SECONDS, "preexec_fn": limited}
     try:
         done = subprocess.run(
             command, capture_output=True, text=True, errors="replace", cwd=folder, **limit
@@ -182,7 +182,7 @@ def answer(line: str, folder: Path, expected: str | None) -> dict[str, Any]:
     except subprocess.TimeoutExpired:
         return {"line": line, "code": "timeout", "failure": "not done in time"}
     text = done.stderr.strip()
-    found: dict[str, Any] = {
+    found = {
         "line": line,
         "code": done.returncode,
         "seconds": round(time.perf_counter() - start, 1),

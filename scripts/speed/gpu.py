@@ -12,98 +12,75 @@ each step, so that a run that is stopped leaves what it has measured.
 import json
 import statistics
 import time
-from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-import trimesh
 from torch import Tensor
 
 import curvireg_torch as cr
 from curvireg_torch.matching import ViewMatcher
-from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
+from curvireg_torch.synthetic import example_mesh
 from scripts import _shared
-from scripts.speed.speed import CAMERA, dented_sphere
+from scripts.speed.speed import Photographs, dented_sphere
 
-SIZE = (480, 640)
 AGREE = 4  # photographs that are also registered on the CPU
 TOGETHER = (1, 8, 64)  # photographs in one call
+Record = dict[str, Any]
 
 
-class Photographs:
-    """Generated photographs of a mesh, with boxes; poses are random."""
-
-    def __init__(self, mesh: trimesh.Trimesh, count: int, seed: int) -> None:
-        self.K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
-        generator = torch.Generator().manual_seed(seed)
-        self.images: list[Tensor] = []
-        self.boxes = torch.zeros(count, 4)
-        self.poses: list[Tensor] = []
-        for k in range(count):
-            pose = random_pose(mesh, self.K, SIZE, generator)
-            image, self.boxes[k] = synthesize_photograph(mesh, pose, self.K, SIZE, generator)
-            self.images.append((255.0 * image).round().to(torch.uint8))
-            self.poses.append(pose)
-
-
-def seconds_of(function: Callable[[], object], device: str) -> float:
+def seconds_of(function: Callable[[], object]) -> float:
     """Of one call, until the device has finished."""
-    finish(device)
+    finish()
     start = time.perf_counter()
     function()
-    finish(device)
+    finish()
     return time.perf_counter() - start
 
 
-def finish(device: str) -> None:
-    if device != "cpu":
-        torch.cuda.synchronize(device)
+def finish() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
 
 
-def degrees(results: Any, others: Any) -> list[float | None]:
-    """Between the rotations of two results of each photograph; None where one has failed."""
+def rate(function: Callable[[], object], count: int) -> Record:
+    """Seconds of a call with ``count`` photographs."""
+    seconds = seconds_of(function)
+    return {"seconds": seconds, "photographs_per_second": count / seconds}
+
+
+def degrees(results: Any, others: Sequence[Tensor | None]) -> list[float | None]:
+    """Between the rotation of each result and another one; None where one is missing."""
     return [
-        float(cr.rotation_error(one.rotation.cpu(), other.rotation.cpu()))
-        if one.ok and other.ok
-        else None
-        for one, other in zip(results, others, strict=True)
+        float(cr.rotation_error(result.rotation.cpu(), R)) if result.ok and R is not None else None
+        for result, R in zip(results, others, strict=True)
     ]
 
 
-def accuracy(results: Any, poses: list[Tensor]) -> dict[str, float]:
-    """Shares of poses within 5 and 15 degrees of the truth, of all photographs."""
-    errors = [
-        float(cr.rotation_error(result.rotation.cpu(), T[:3, :3])) if result.ok else 180.0
-        for result, T in zip(results, poses, strict=True)
-    ]
-    return {f"within_{limit}": sum(e < limit for e in errors) / len(errors) for limit in (5, 15)}
+def rotations(results: Any) -> list[Tensor | None]:
+    return [result.rotation.cpu() if result.ok else None for result in results]
 
 
-def measure(options: Namespace, record: Callable[[str, Any], None]) -> None:
-    device = options.device
-    views = cr.sample_views(azimuth_step=60, elevations=[0, 30]) if options.few_views else None
-    count = options.photographs
-    sphere = dented_sphere(2 if options.few_views else 6)
+def measure(
+    count: int, device: str, *, few_views: bool, record: Callable[[str, Any], None]
+) -> None:
+    views = cr.sample_views(azimuth_step=60, elevations=[0, 30]) if few_views else None
+    sphere = dented_sphere(2 if few_views else 6)
     new = Photographs(sphere, count, seed=0)
     others = Photographs(sphere, count, seed=1)
     record("photographs", count)
 
-    def build(on: str) -> cr.ViewBank:
-        return cr.ViewBank.build(sphere, views, progress=False, device=on)
+    def build(mesh: Any = sphere) -> cr.ViewBank:
+        return cr.ViewBank.build(mesh, views, progress=False, device=device)
 
-    if device != "cpu":
-        build(device)  # kernels are loaded
-    seconds = seconds_of(lambda: build(device), device)
-    bank = build(device)
-    record("bank", {"seconds": seconds, "views": len(bank)})
+    bank = build()  # kernels are loaded
+    record("bank", {"seconds": seconds_of(build), "views": len(bank)})
 
     matcher = ViewMatcher(bank)
     matcher(others.images, others.boxes)
     matcher(new.images, new.boxes)  # describes the views that it needs
-    seconds = seconds_of(lambda: matcher(new.images, new.boxes), device)
-    record("rank", {"seconds": seconds, "photographs_per_second": count / seconds})
+    record("rank", rate(lambda: matcher(new.images, new.boxes), count))
 
     registrar = cr.Registrar(matcher)
 
@@ -111,40 +88,37 @@ def measure(options: Namespace, record: Callable[[str, Any], None]) -> None:
         return registrar(some.images[first:last], some.boxes[first:last], some.K)
 
     register(others, 0, count)
-    seconds = seconds_of(lambda: register(new, 0, count), device)
-    record("new", {"seconds": seconds, "photographs_per_second": count / seconds})
+    record("new", rate(lambda: register(new, 0, count), count))
     for together in TOGETHER:
         number = min(together, count)
         register(new, 0, number)
-        seconds = seconds_of(lambda n=number: register(new, 0, n), device)  # type: ignore[misc]
-        measured = {"seconds": seconds, "photographs_per_second": number / seconds}
-        record(f"register_{together}", measured)
+        record(f"register_{together}", rate(lambda n=number: register(new, 0, n), number))  # type: ignore[misc]
     results = register(new, 0, count)
-    record("accuracy", accuracy(results, new.poses))
-    alone = [register(new, k, k + 1)[0] for k in range(min(AGREE, count))]
-    record("degrees_alone_and_together", degrees(alone, results[: len(alone)]))
+    errors = degrees(results, [pose[:3, :3] for pose in new.poses])
+    within = {
+        f"within_{limit}": sum(error is not None and error < limit for error in errors) / count
+        for limit in (5, 15)
+    }
+    record("accuracy", within)
+    few = min(AGREE, count)
+    alone = [register(new, k, k + 1)[0] for k in range(few)]
+    record("degrees_alone_and_together", degrees(alone, rotations(results[:few])))
 
     truck = example_mesh()
     of_truck = Photographs(truck, count, seed=2)
-    truck_bank = cr.ViewBank.build(truck, views, progress=False, device=device)
-    two = cr.Registrar([bank, truck_bank])
-    images = [*new.images[: count // 2], *of_truck.images[count // 2 :]]
-    boxes = torch.cat([new.boxes[: count // 2], of_truck.boxes[count // 2 :]])
-    two(images, boxes, new.K)
-    seconds = seconds_of(lambda: two(images, boxes, new.K), device)
+    two = cr.Registrar([bank, build(truck)])
+    half = count // 2
+    images = [*new.images[:half], *of_truck.images[half:]]
+    boxes = torch.cat([new.boxes[:half], of_truck.boxes[half:]])
     found = two(images, boxes, new.K)
-    models = [0] * (count // 2) + [1] * (count - count // 2)
-    pairs = zip(found, models, strict=True)
-    right = [result.ok and result.mesh_index == model for result, model in pairs]
-    measured = {"seconds": seconds, "photographs_per_second": count / seconds}
+    right = [result.ok and result.mesh_index == (k >= half) for k, result in enumerate(found)]
+    measured = rate(lambda: two(images, boxes, new.K), count)
     record("two_meshes", {**measured, "right_mesh": sum(right) / count})
 
     on_cpu = cr.Registrar(bank.to("cpu"))
-    number = min(AGREE, count)
-    expected = on_cpu(new.images[:number], new.boxes[:number], new.K)
-    seconds = seconds_of(lambda: on_cpu(new.images[:number], new.boxes[:number], new.K), "cpu")
-    record("cpu", {"seconds": seconds, "photographs_per_second": number / seconds})
-    errors = degrees(results[:number], expected)
+    expected = on_cpu(new.images[:few], new.boxes[:few], new.K)
+    record("cpu", rate(lambda: on_cpu(new.images[:few], new.boxes[:few], new.K), few))
+    errors = degrees(results[:few], rotations(expected))
     known = [error for error in errors if error is not None]
     record("degrees_from_cpu", {"each": errors, "median": statistics.median(known or [180.0])})
 
@@ -156,11 +130,10 @@ def main() -> None:
     parser.add_argument("--few-views", action="store_true", help="to try the script itself")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    on_cpu = options.device == "cpu"
     start = time.perf_counter()
-    measured: dict[str, Any] = {
+    measured = {
         **_shared.stamp(),
-        "processor": _shared.processor() if on_cpu else torch.cuda.get_device_name(options.device),
+        "processor": _shared.processor(options.device),
         "torch": torch.__version__,
     }
 
@@ -170,7 +143,7 @@ def main() -> None:
         print(name, json.dumps(value), flush=True)
         _shared.write_json(options.out, measured)
 
-    measure(options, record)
+    measure(options.photographs, options.device, few_views=options.few_views, record=record)
 
 
 if __name__ == "__main__":

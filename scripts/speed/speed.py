@@ -44,6 +44,7 @@ FRAMES = 12
 EARLIER = 10  # photographs that an earlier command registered
 NEW = 4  # new photographs of the steps that register one after another
 SUBDIVISIONS = 6  # of an icosphere: 81,920 faces
+SIZE = (480, 640)
 CAMERA = (900.0, 900.0, 319.5, 239.5)  # fx, fy, cx, cy of a photograph of 640 x 480 px
 
 HERE = (
@@ -65,28 +66,37 @@ def dented_sphere(subdivisions: int) -> Any:
     return mesh
 
 
-def write_inputs(folder: str, photographs: int) -> None:
-    """Write a dented sphere, photographs of it in random poses and their boxes; runs in this
-    checkout."""
-    import cv2
-    import torch
+class Photographs:
+    """Generated photographs (3, H, W) uint8 of a mesh in random poses, with boxes (N, 4)."""
 
-    import curvireg_torch as cr
-    from curvireg_torch.synthetic import random_pose, synthesize_photograph
+    def __init__(self, mesh: Any, count: int, seed: int) -> None:
+        import torch
+
+        import curvireg_torch as cr
+        from curvireg_torch.synthetic import random_pose, synthesize_photograph
+
+        self.K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
+        generator = torch.Generator().manual_seed(seed)
+        self.images = []
+        self.boxes = torch.zeros(count, 4)
+        self.poses = []
+        for k in range(count):
+            pose = random_pose(mesh, self.K, SIZE, generator)
+            image, self.boxes[k] = synthesize_photograph(mesh, pose, self.K, SIZE, generator)
+            self.images.append((255.0 * image).round().to(torch.uint8))
+            self.poses.append(pose)
+
+
+def write_inputs(folder: str, photographs: int) -> None:
+    """Write a dented sphere, photographs of it and their boxes; runs in this checkout."""
+    import cv2
 
     mesh = dented_sphere(SUBDIVISIONS)
     mesh.export(Path(folder, "mesh.ply"))
-    K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
-    size = (480, 640)
-    boxes = []
-    for k in range(EARLIER + photographs):
-        pose = random_pose(mesh, K, size, generator)
-        photograph, box = synthesize_photograph(mesh, pose, K, size, generator)
-        pixels = (255 * photograph.permute(1, 2, 0).flip(2).numpy()).round().astype("uint8")
-        cv2.imwrite(str(Path(folder, f"photo{k}.png")), pixels)
-        boxes.append(box.tolist())
-    Path(folder, "boxes.json").write_text(json.dumps(boxes))
+    generated = Photographs(mesh, EARLIER + photographs, seed=0)
+    for k, image in enumerate(generated.images):
+        cv2.imwrite(str(Path(folder, f"photo{k}.png")), image.permute(1, 2, 0).flip(2).numpy())
+    _shared.write_json(Path(folder, "boxes.json"), generated.boxes.tolist())
 
 
 def measure_layers(photographs: int, device: str) -> float:
@@ -159,7 +169,7 @@ def measure(step: str, folder: str, photographs: int, device: str) -> dict[str, 
         register(earlier)
         return {"seconds": 0.0}
     if step == "fresh":
-        one_by_one: Sequence[int] = earlier
+        one_by_one = earlier
     else:
         register(earlier[:1])  # loads what every later photograph shares
         one_by_one = new[:NEW]
@@ -218,7 +228,7 @@ def compare(
     checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int, device: str
 ) -> Any:
     """Least seconds and megabytes of each step in each checkout, measured in turn."""
-    found: dict[str, dict[str, Any]] = {name: {} for name in checkouts}
+    found = {name: {} for name in checkouts}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -275,8 +285,6 @@ def cell(measurement: dict[str, float]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    import torch
-
     parser = _shared.parser_of(__doc__)
     parser.add_argument(
         "--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository"
@@ -296,9 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     record = {
         "date": _shared.today(),
         "commits": {name: _shared.commit(root) for name, root in checkouts.items()},
-        "processor": _shared.processor()
-        if options.device == "cpu"
-        else torch.cuda.get_device_name(options.device),
+        "processor": _shared.processor(options.device),
         "photographs": options.photographs,
         "times": compare(
             checkouts, options.steps, options.photographs, options.rounds, options.device
