@@ -7,6 +7,7 @@ import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evidence import RANK_ALONE, Evidence, EvidenceWeights
+from tests._support.numbers import double
 
 NAMES = [field.name for field in fields(Evidence)]
 
@@ -44,11 +45,11 @@ def test_a_similar_mesh_keeps_the_order_of_the_ranking():
 
 def test_evidence_is_read_from_poses():
     seen = {
-        "rank": torch.tensor([0.0, -1.0]).double(),
+        "rank": double([0.0, -1.0]),
         "similarity": torch.tensor([0.7, 0.6]).double(),
         "edge_support": torch.tensor([0.4, torch.nan]).double(),
-        "appearance": torch.tensor([0.5, -0.5]).double(),
-        "keypoints": torch.tensor([0.0, 20.0]).double(),
+        "appearance": double([0.5, -0.5]),
+        "keypoints": double([0.0, 20.0]),
         "contours": torch.tensor([0.3, 0.0]).double(),
     }
     read = Evidence.measured(**seen)
@@ -64,7 +65,7 @@ def test_evidence_is_read_from_poses():
 
 def test_photographs_are_averaged_by_weight():
     both = Evidence.stack([evidence(1, details=[1.0]), evidence(1, details=[4.0])])
-    mean = both.mean(torch.tensor([2.0, 1.0]).double())
+    mean = both.mean(double([2.0, 1.0]))
     assert mean.details.tolist() == [2.0]
     assert mean.rank.tolist() == [0.0]
 

@@ -3,6 +3,7 @@
 import ast
 import importlib
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,11 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "curvireg_torch"
 INITS = sorted(PACKAGE.rglob("__init__.py"))
+
+
+@cache
+def tree_of(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def dotted(path):
@@ -32,7 +38,7 @@ def imported(tree, module, *, is_package):
 
 @pytest.mark.parametrize("path", INITS, ids=dotted)
 def test_packages_list_what_they_export(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = tree_of(path)
     package = importlib.import_module(dotted(path))
     public = {
         name
@@ -49,7 +55,7 @@ def test_names_of_packages_are_those_that_they_export():
     wrong = []
     for folder in ("curvireg_torch", "tests", "scripts"):
         for path in sorted((ROOT / folder).rglob("*.py")):
-            tree = ast.parse(path.read_text(encoding="utf-8"))
+            tree = tree_of(path)
             is_package = path.name == "__init__.py"
             for source, name in imported(tree, dotted(path), is_package=is_package):
                 if source not in exports or name in getattr(exports[source], "__all__", ()):
@@ -63,7 +69,7 @@ def test_names_of_packages_are_those_that_they_export():
 def test_private_names_stay_in_their_modules():
     wrong = []
     for path in sorted(PACKAGE.rglob("*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        tree = tree_of(path)
         pairs = imported(tree, dotted(path), is_package=path.name == "__init__.py")
         wrong += [
             f"{path.relative_to(ROOT)}: {source}.{name}"
@@ -88,7 +94,7 @@ def test_public_functions_are_used_outside_their_modules():
     wrong = [
         f"{path.relative_to(ROOT)}: {node.name}"
         for path in sorted(PACKAGE.rglob("*.py"))
-        for node in ast.parse(texts[path]).body
+        for node in tree_of(path).body
         if isinstance(node, ast.FunctionDef)
         and not node.name.startswith("_")
         and files_of[node.name] == {path}

@@ -9,11 +9,12 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import demo_scene, example_mesh, random_pose, synthesize_photograph
+from tests._support.numbers import eye, seeded
 from tests._support.scenes import CAMERA, SIZE
 
 
 def test_photograph_shows_the_colours_of_the_mesh_at_its_pose_which_must_show_the_object():
-    generator = torch.Generator().manual_seed(3)
+    generator = seeded(3)
     mesh = example_mesh()
     paint = np.array([[255, 0, 255, 255], [180, 0, 180, 255]], np.uint8)
     mesh.visual.face_colors = paint[np.arange(len(mesh.faces)) % 2]
@@ -26,7 +27,7 @@ def test_photograph_shows_the_colours_of_the_mesh_at_its_pose_which_must_show_th
     rows, columns = expected.nonzero().unbind(dim=1)
     inside = torch.stack([columns.min(), rows.min(), columns.max(), rows.max()])
     assert (box - inside).abs().max() < 1
-    behind = torch.eye(4, dtype=torch.float64)
+    behind = eye(4)
     behind[2, 3] = -1.0
     with pytest.raises(InvalidInputError, match="no pixel"):
         synthesize_photograph(example_mesh(), behind, CAMERA, SIZE, torch.Generator())

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from curvireg_torch.errors import InvalidInputError
+from tests._support.numbers import double, seeded
 
 SIZE = 24
 
@@ -52,11 +53,9 @@ def degenerate_images():
         "one pixel": torch.full((1, 1, 1, 1), 0.5),
         "one bright pixel": bright,
         "checkerboard": ((x[:, None] + x) % 2)[None, None],
-        "saturated": torch.rand(1, 1, 16, 16, generator=torch.Generator().manual_seed(1))
-        .mul(3.0)
-        .clamp(max=1.0),
+        "saturated": torch.rand(1, 1, 16, 16, generator=seeded(1)).mul(3.0).clamp(max=1.0),
         "two levels": (x >= 8).float().expand(1, 1, 16, 16).contiguous(),
-        "row": torch.rand(1, 1, 1, 16, generator=torch.Generator().manual_seed(0)),
+        "row": torch.rand(1, 1, 1, 16, generator=seeded(0)),
     }
 
 
@@ -101,7 +100,7 @@ class LayerContract:
     def test_batched_equals_one_by_one(self, case):
         """The images differ in contrast and depth range, so that a normalisation over the batch is
         detected."""
-        scale = torch.tensor([1.0, 0.1, 0.0], dtype=torch.float64).view(-1, 1, 1, 1)
+        scale = double([1.0, 0.1, 0.0]).view(-1, 1, 1, 1)
         x = case.inputs(3, SIZE, dtype=torch.float64) * scale
         parts = [
             torch.cat(part)
@@ -141,7 +140,7 @@ class LayerContract:
         """At generic points, where no maximum, threshold or suppression switches within the
         step."""
         x = case.inputs(1, 9, seed=3, dtype=torch.float64)
-        generator = torch.Generator().manual_seed(0)
+        generator = seeded(0)
         noise = torch.rand(x.shape, generator=generator, dtype=torch.float64)
         x = 0.95 * x + 0.05 * noise * (x > 0)  # in the range of images
         # Pixels of 0 may be background of a depth image, which a step would make visible.
@@ -177,7 +176,7 @@ class LayerContract:
         want = torch.autograd.grad(loss(x.requires_grad_()), x)[0]
         y = case(x).detach()
         x = x.detach()
-        direction = torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(0))
+        direction = torch.randn(x.shape, dtype=x.dtype, generator=seeded(0))
         if block is not None:
             monkeypatch.setattr("curvireg_torch.filters.operations.BLOCK_PIXELS", block)
         torch.testing.assert_close(

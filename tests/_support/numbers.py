@@ -1,7 +1,15 @@
-"""Numbers in double precision."""
+"""Numbers in double precision, and generators of random ones."""
 
 import torch
 
 
 def double(values):
     return torch.tensor(values, dtype=torch.float64)
+
+
+def eye(n):
+    return torch.eye(n, dtype=torch.float64)
+
+
+def seeded(seed):
+    return torch.Generator().manual_seed(seed)

@@ -11,6 +11,7 @@ from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration.result import Detection
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
+from tests._support.numbers import double, seeded
 
 SIZE = (180, 240)
 CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
@@ -34,7 +35,7 @@ def learned_registrar():
 @cache
 def scene(seed):
     """image (3, H, W), box (4,), true T_cam_from_model (4, 4)."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     T = random_pose(example_mesh(), CAMERA, SIZE, generator, elevations=(5.0, 50.0))
     image, box = synthesize_photograph(example_mesh(), T, CAMERA, SIZE, generator)
     return image, box, T
@@ -50,10 +51,10 @@ def sequence(count):
     """Photographs, boxes and poses: 4 degrees about a vertical axis and 2 % nearer from frame to
     frame."""
     T = scene(0)[2]
-    step = rotation_from_axis_angle(torch.tensor([0.0, 0.07, 0.0], dtype=torch.float64))
+    step = rotation_from_axis_angle(double([0.0, 0.07, 0.0]))
     frames = []
     for _ in range(count):
-        generator = torch.Generator().manual_seed(9)
+        generator = seeded(9)
         frames.append((*synthesize_photograph(example_mesh(), T, CAMERA, SIZE, generator), T))
         T = T.clone()
         T[:3, :3] = step @ T[:3, :3]
@@ -71,9 +72,25 @@ def truck_registrar(**changes):
     return Registrar(truck_bank(), pipeline=replace(truck_bank().pipeline, **changes))
 
 
+def bytes_bgr(image):
+    """A photograph (3, H, W) in [0, 1] as OpenCV has it."""
+    pixels = (image.permute(1, 2, 0).flip(-1) * 255).round().byte()
+    return pixels.contiguous().numpy()
+
+
 def write_photo(path, image):
     """Write a photograph (3, H, W) in [0, 1]."""
-    assert cv2.imwrite(str(path), (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy())
+    assert cv2.imwrite(str(path), bytes_bgr(image))
+
+
+def write_video(path, images, rate=10.0):
+    """Write photographs (3, 180, 240) in [0, 1] as a video."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, SIZE[::-1])
+    for image in images:
+        video.write(bytes_bgr(image))
+    video.release()
+    return path
 
 
 def found_in(registrar, image, boxes):

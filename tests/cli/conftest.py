@@ -32,13 +32,11 @@ def register_one(folder, tmp_path):
     """Run ``curvireg register`` on one photograph, by default with its box; results go to
     ``tmp_path / "out"``."""
 
-    def run(*words, photo="photos/0.png", mesh="truck.safetensors", box=None):
+    def run(*words, photo="photos/0.png", mesh="truck.safetensors", box=None, out="out"):
         box = box_of(0) if box is None else box
         boxes = ["--box", *box] if box else []
-        out = ["--out", str(tmp_path / "out"), "--quiet"]
-        return main(
-            ["register", str(folder / photo), str(folder / mesh), *boxes, *out, *map(str, words)]
-        )
+        command = ["register", folder / photo, folder / mesh, *boxes, *words]
+        return main([*map(str, command), "--out", str(tmp_path / out), "--quiet"])
 
     return run
 

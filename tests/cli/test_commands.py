@@ -75,10 +75,8 @@ def test_a_process_ends_as_usual_after_a_mistake_in_its_options():
 def test_bank_is_registered_to(folder, register_one, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(PRESETS, DEFAULT, SMALL)
     out = tmp_path / "new.safetensors"
-    assert (
-        main(["bank", str(folder / "truck.ply"), "--out", str(out), "--pose", "upright", "--quiet"])
-        == 0
-    )
+    words = ["--out", str(out), "--pose", "upright", "--quiet"]
+    assert main(["bank", str(folder / "truck.ply"), *words]) == 0
     assert "6 views" in capsys.readouterr().out
     assert register_one("--no-refine", mesh=out) == 0
 
@@ -170,12 +168,8 @@ def test_wrong_inputs_are_named(tmp_path, monkeypatch, capsys):
     wrong = []
     for line, expected in cases(tmp_path):
         try:
-            code = main(
-                [
-                    *shlex.split(line),
-                    *([] if line.startswith(("view", "frobnicate")) else ["--quiet"]),
-                ]
-            )
+            quiet = [] if line.startswith(("view", "frobnicate")) else ["--quiet"]
+            code = main([*shlex.split(line), *quiet])
         except SystemExit as stop:  # of argparse
             code = stop.code
         printed = capsys.readouterr().err.splitlines()

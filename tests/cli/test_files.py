@@ -3,7 +3,6 @@
 import base64
 import html
 import io
-import json
 import os
 import re
 import shutil
@@ -19,7 +18,7 @@ import pytest
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.formats.exports import ros, trackers
+from curvireg_torch.formats.exports import trackers
 from curvireg_torch.jobs import outputs
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.visualization import sheet
@@ -57,34 +56,25 @@ def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
     assert "no such file" in figures[-1][1]
 
 
-def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkeypatch):
-    words = [
-        folder / "photos" / "0.png",
-        folder / "truck.safetensors",
-        "--box",
-        *box_of(0),
-        "--camera",
-        *CAMERA,
-    ]
-    assert register(*words) == 0
-    found = json.loads((tmp_path / "out" / "result.json").read_text())
-    T = (
-        np.diag([1.0, -1.0, -1.0, 1.0])
-        @ trimesh.load(tmp_path / "out" / "pose.glb").graph["object"][0]
-    )
+def test_register_writes_the_mesh_at_its_pose(register_one, document, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    words = ["--no-refine", "--camera", *CAMERA]
+    assert register_one(*words) == 0
+    found = document()
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    T = flip @ trimesh.load(out / "pose.glb").graph["object"][0]
     np.testing.assert_allclose(T[:3], np.c_[found["rotation"], found["translation"]], atol=1e-5)
     # For a mesh that is too large, none is written and an older one is removed.
     monkeypatch.setattr("curvireg_torch.jobs.result_files.MAX_GLB_FACES", 10)
-    assert register(*words, "--format", "ros") == 0
-    names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names & {"pose.glb", *ros.FILES} >= {"pose.yaml", "tf.yaml"}
-    assert "pose.glb" not in names
-    for tool, files in (("m3t", trackers.M3T_FILES), ("visp", trackers.VISP_FILES)):
-        assert register(*words, "--format", tool) == 0
-        names = {path.name for path in (tmp_path / "out").iterdir()}
-        assert names & {*outputs.FOR_TOOLS} == {*files}
-    assert register(*words) == 0
-    assert not {"pose.glb", *ros.FILES} & {path.name for path in (tmp_path / "out").iterdir()}
+    for more, files in (
+        (["--format", "ros"], {"pose.yaml", "tf.yaml"}),
+        (["--format", "m3t"], {*trackers.M3T_FILES}),
+        (["--format", "visp"], {*trackers.VISP_FILES}),
+        ([], set()),
+    ):
+        assert register_one(*words, *more) == 0
+        names = {path.name for path in out.iterdir()}
+        assert names & {"pose.glb", *outputs.FOR_TOOLS} == files
 
 
 # Runs the command line with a command that prints text and imports nothing large
@@ -151,32 +141,24 @@ def test_a_command_runs_without_standard_output_and_error(closed):
     ("draws", "file"), [("pose_glb", "pose.glb"), ("registration_sheet", "overlay.png")]
 )
 def test_a_file_that_cannot_be_drawn_costs_no_other(
-    folder, register, tmp_path, monkeypatch, threads, draws, file, n
+    register_one, tmp_path, monkeypatch, threads, draws, file, n
 ):
     threads(n)
     fail = Mock(side_effect=InvalidInputError("it cannot be drawn"))
     monkeypatch.setattr(f"curvireg_torch.jobs.result_files.{draws}", fail)
-    words = [
-        folder / "photos" / "0.png",
-        folder / "truck.safetensors",
-        "--box",
-        *box_of(0),
-        "--camera",
-        *CAMERA,
-    ]
-    assert register(*words) == 2
+    assert register_one("--no-refine", "--camera", *CAMERA) == 2
     written = {path.name for path in (tmp_path / "out").iterdir()} - {MARKER}
     assert written == {"result.json", "overlay.png", "pose.glb"} - {file}
 
 
 def test_a_photograph_whose_name_is_no_text_is_registered_and_named(
-    folder, register, document, tmp_path, monkeypatch
+    folder, register_one, document, tmp_path, monkeypatch
 ):
     """Its bytes are no UTF-8; nothing was printed once the result was written."""
     photo = tmp_path / os.fsdecode(b"Gr\xfc\xdfe.png")
     shutil.copy(folder / "photos" / "0.png", photo)
     printed = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(printed, "utf-8", write_through=True))
-    assert register(photo, folder / "truck.safetensors", "--box", *box_of(0)) == 0
+    assert register_one("--no-refine", photo=photo) == 0
     assert b"viewpoint: " in printed.getvalue()
     assert document()["inputs"]["photo"] == str(photo)

@@ -20,7 +20,7 @@ from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, check_pose, table
 from tests._support.quick import slow_after
 from tests._support.results import registration
-from tests._support.scenes import learned_registrar, sequence
+from tests._support.scenes import learned_registrar, sequence, write_photo, write_video
 
 
 @pytest.fixture(scope="module")
@@ -29,14 +29,10 @@ def frames(tmp_path_factory):
     learned_registrar().bank.save(folder / "truck.safetensors")
     (folder / "shots").mkdir()
     scenes = sequence(3)
-    writer = cv2.VideoWriter(
-        str(folder / "turn.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (240, 180)
-    )
-    for k, (image, _, _) in enumerate(scenes):
-        pixels = (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy()
-        cv2.imwrite(str(folder / "shots" / f"{k}.png"), pixels)
-        writer.write(pixels)
-    writer.release()
+    images = [image for image, _, _ in scenes]
+    for k, image in enumerate(images):
+        write_photo(folder / "shots" / f"{k}.png", image)
+    write_video(folder / "turn.avi", images, rate=25.0)
     with_exif(folder / "shots" / "0.png", exif(1, 38))
     (folder / "shots" / "3.png").write_bytes(b"no photograph")
     return folder, scenes
@@ -100,38 +96,36 @@ def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     assert 2 < (pictures[2] - (scenes[2][0] * 255).int()).abs().float().mean() < 30
 
 
-def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(
-    frames, follow, tmp_path, monkeypatch, capsys
-):
-    boxes = []
+@pytest.fixture
+def boxes(monkeypatch):
+    """The boxes that a follower is given."""
+    given = []
     call = Follower.__call__
     monkeypatch.setattr(
-        Follower,
-        "__call__",
-        lambda self, image, box=None: boxes.append(box) or call(self, image, box),
+        Follower, "__call__", lambda self, image, box: given.append(box) or call(self, image, box)
     )
+    return given
+
+
+def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(
+    frames, follow, boxes, tmp_path, capsys
+):
     assert follow("--camera", *CAMERA, "--out", tmp_path, "--json", source="turn.avi") == 0
     assert boxes == [frames[1][0][1].tolist(), None, None]
     printed = capsys.readouterr()
     assert "3 frames: 3 reliable, 0 unsure" in printed.err
     lines = [json.loads(line) for line in printed.out.splitlines()]
     rows = table(tmp_path)
-    assert (
-        [row["photo"] for row in rows]
-        == [line["frame"] for line in lines]
-        == [f"turn-00000{k}" for k in range(3)]
-    )
+    assert [row["photo"] for row in rows] == [f"turn-00000{k}" for k in range(3)]
     for line, row in zip(lines, rows, strict=True):
-        assert (line["verdict"], line["confidence"]) == (row["verdict"], float(row["confidence"]))
+        assert (line["frame"], line["verdict"]) == (row["photo"], row["verdict"])
+        assert line["confidence"] == float(row["confidence"])
         assert line["translation"] == [float(row[name]) for name in ("tx", "ty", "tz")]
         assert len(line["quaternion"]) == 4
     assert [line["seconds"] for line in lines] == sorted(line["seconds"] for line in lines)
     assert Video(tmp_path / "overlay.mp4").fps == 25.0
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        MARKER,
-        "overlay.mp4",
-        "results.csv",
-    ]
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == {MARKER, "overlay.mp4", "results.csv"}
 
 
 def test_an_animation_is_no_video(follow, tmp_path, capsys):
@@ -142,13 +136,8 @@ def test_an_animation_is_no_video(follow, tmp_path, capsys):
     assert "an animation; save it as MP4" in capsys.readouterr().err
 
 
-def test_follow_takes_the_boxes_of_a_detector_by_frame(frames, follow, tmp_path, monkeypatch):
+def test_follow_takes_the_boxes_of_a_detector_by_frame(frames, follow, boxes, tmp_path):
     scenes = frames[1]
-    boxes = []
-    call = Follower.__call__
-    monkeypatch.setattr(
-        Follower, "__call__", lambda self, image, box: boxes.append(box) or call(self, image, box)
-    )
     x0, y0, x1, y1 = (
         (v + 0.5) / side for v, side in zip(scenes[0][1], (240, 180) * 2, strict=True)
     )
@@ -216,9 +205,8 @@ def test_frames_of_another_size_scale_the_camera(frames, follow, tmp_path, kind)
     fx, fy, cx, cy = map(float, CAMERA)
     matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
     calibration = tmp_path / "camera.json"
-    calibration.write_text(
-        json.dumps({"camera_matrix": matrix, "image_width": 240, "image_height": 180})
-    )
+    size = {"image_width": 240, "image_height": 180}
+    calibration.write_text(json.dumps({"camera_matrix": matrix, **size}))
     words = ("--camera", calibration if kind == "file" else "exif")
     assert follow(*words, "--out", tmp_path / "out", source=str(shots)) == 0
     rows = table(tmp_path / "out")
@@ -270,18 +258,8 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(
         return result
 
     monkeypatch.setattr(Follower, "_refined", unconfirmed)
-    assert (
-        follow(
-            "--camera",
-            *CAMERA,
-            "--start",
-            tmp_path / "start.json",
-            "--out",
-            tmp_path / "out",
-            box=False,
-        )
-        == 0
-    )
+    words = ["--camera", *CAMERA, "--start", tmp_path / "start.json", "--out", tmp_path / "out"]
+    assert follow(*words, box=False) == 0
     rows = table(tmp_path / "out")
     for row, (_, _, T) in zip(rows, frames[1], strict=False):
         check_pose(row, T, 4.0, 0.04)

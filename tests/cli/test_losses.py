@@ -2,66 +2,40 @@
 
 import shutil
 
-import cv2
-import numpy as np
 import pytest
 
 from curvireg_torch.cli import main
 from curvireg_torch.formats.exports.ros import FILES
 from curvireg_torch.jobs.outputs import MARKER, output_folder
-from tests._support.lists import CAMERA, box_of, lines, table, written
+from tests._support.lists import CAMERA, box_of, table, written
 from tests._support.quick import slow_after
-from tests._support.scenes import scene
+from tests._support.scenes import scene, write_video
 
-
-def write_video(path, seeds):
-    """A video of photographs of the scenes with these seeds."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (240, 180))
-    for seed in seeds:
-        pixels = (scene(seed)[0].permute(1, 2, 0).flip(-1) * 255).round().byte().numpy()
-        video.write(np.ascontiguousarray(pixels))
-    video.release()
-    return path
-
-
-VIDEOS = [
+SOURCES = [
+    ("left/shot.png", "right/shot.png"),
     ("left/cam.avi", "right/cam.avi"),
     ("a.avi", "a.mkv"),
     ("x/shots/cam.avi", "y/shots/cam.avi"),
 ]
 
 
-@pytest.mark.parametrize(("first", "second"), slow_after(1, VIDEOS))
-def test_two_videos_of_one_name_keep_their_own_results(folder, register, tmp_path, first, second):
-    videos = [write_video(tmp_path / name, [seed]) for seed, name in enumerate((first, second))]
-    assert register(*videos, folder / "truck.safetensors", "--box", *box_of(0)) == 0
+@pytest.mark.parametrize(("first", "second"), slow_after(2, SOURCES))
+def test_sources_of_one_name_keep_their_own_results(folder, register, tmp_path, first, second):
+    sources = [tmp_path / first, tmp_path / second]
+    for seed, source in enumerate(sources):
+        if source.suffix == ".png":
+            source.parent.mkdir()
+            shutil.copy(folder / "photos" / f"{seed}.png", source)
+        else:
+            write_video(source, [scene(seed)[0]])
+    words = [folder / "truck.safetensors", "--box", *box_of(0)]
+    assert register(*sources, *words) == 0
     rows = table(tmp_path / "out")
-    assert [row["photo"] for row in rows] == [f"{video}:000000" for video in videos]
-    together = lines(tmp_path / "out")
-    for number, video in enumerate(videos):
-        assert (
-            register(video, folder / "truck.safetensors", "--box", *box_of(0), out=str(number)) == 0
-        )
-        (alone,) = lines(tmp_path / str(number))
-        assert (alone["rotation"], alone["score"]) == (
-            together[number]["rotation"],
-            together[number]["score"],
-        )
-    assert together[0]["rotation"] != together[1]["rotation"]
-    assert register(*videos[::-1], folder / "truck.safetensors", "--box", *box_of(0)) == 0
-    assert [row["r11"] for row in table(tmp_path / "out")] == [row["r11"] for row in rows[::-1]]
-
-
-def test_photographs_of_one_name_keep_their_own_results(folder, register, tmp_path):
-    for side, seed in (("left", 0), ("right", 1)):
-        (tmp_path / side).mkdir()
-        shutil.copy(folder / "photos" / f"{seed}.png", tmp_path / side / "photo.png")
-    photos = tmp_path / "left", tmp_path / "right"
-    assert register(*photos, folder / "truck.safetensors", "--box", *box_of(0)) == 0
-    rows = table(tmp_path / "out")
-    assert [row["photo"] for row in rows] == [str(side / "photo.png") for side in photos]
+    frame = "" if first.endswith("png") else ":000000"
+    assert [row["photo"] for row in rows] == [f"{source}{frame}" for source in sources]
     assert rows[0]["r11"] != rows[1]["r11"]
+    assert register(*sources[::-1], *words) == 0
+    assert [row["r11"] for row in table(tmp_path / "out")] == [row["r11"] for row in rows[::-1]]
 
 
 THEIRS = ("result.json", "overlay.png", "pose.glb", *FILES)
@@ -87,83 +61,56 @@ def test_register_removes_no_file_of_others(
     )
 
 
-def test_register_overwrites_no_input(folder, register, refused, tmp_path, capsys):
+def test_register_overwrites_no_input(folder, register_one, register, refused, tmp_path, capsys):
     out = tmp_path / "out"
-    words = [folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA]
-    assert register(folder / "photos" / "0.png", *words) == 0
+    words = ["--camera", *CAMERA]
+    assert register_one("--no-refine", *words) == 0
     capsys.readouterr()
+    row = [folder / "photos" / "0.png", *box_of(0)]
+    listed = written(out / "results.csv", "photo,x0,y0,x1,y1", row)
     before = {path: path.read_bytes() for path in out.iterdir()}
-    start = ["--camera", *CAMERA, "--start", out / "result.json"]
-    refused(
-        register(folder / "photos" / "0.png", words[0], *start),
-        "result.json: an input of this command",
-    )
-    refused(register(out / "overlay.png", *words), "overlay.png: an input of this command")
-    refused(
-        register(folder / "photos" / "0.png", out / "pose.glb", *words[1:]),
-        "pose.glb: an input of this command",
-    )
-    start[-1] = f"{out / 'result.json'}:0"
-    refused(register(folder / "photos" / "0.png", words[0], *start), "result.json")
-    listed = written(
-        out / "results.csv", "photo,x0,y0,x1,y1", [folder / "photos" / "0.png", *box_of(0)]
-    )
-    before[listed] = listed.read_bytes()
-    refused(register("--list", listed, words[0]), "results.csv: an input of this command")
+    result = out / "result.json"
+    refused(register_one(*words, "--start", result, box=()), "result.json: an input of this")
+    refused(register_one(*words, "--start", f"{result}:0", box=()), "result.json")
+    refused(register_one(*words, photo=out / "overlay.png"), "overlay.png: an input of this")
+    refused(register_one(*words, mesh=out / "pose.glb"), "pose.glb: an input of this command")
+    refused(register("--list", listed, folder / "truck.ply"), "results.csv: an input of this")
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
 def test_a_second_list_does_not_remove_the_rows_of_the_first(folder, register, refused, tmp_path):
     bank = folder / "truck.safetensors"
     rows = [[f"photos/{seed}.png", *box_of(seed)] for seed in (0, 1)]
-    lists = [
-        written(folder / f"{seed}.csv", "photo,x0,y0,x1,y1", row) for seed, row in enumerate(rows)
-    ]
-    assert register("--list", lists[0], bank) == 0
+    header = "photo,x0,y0,x1,y1"
+    first, second = (written(folder / f"{k}.csv", header, row) for k, row in enumerate(rows))
+    assert register("--list", first, bank) == 0
     before = (tmp_path / "out" / "results.csv").read_bytes()
-    refused(
-        register("--list", lists[1], bank),
-        "out/index.html: holds results of",
-        "0.csv, which would be lost",
-    )
-    refused(
-        register(*(folder / "photos" / f"{seed}.png" for seed in (0, 1)), bank),
-        "0.csv, which would be lost",
-    )
+    lost = "0.csv, which would be lost"
+    refused(register("--list", second, bank), "out/index.html: holds results of", lost)
+    refused(register(*(folder / row[0] for row in rows), bank), lost)
     assert (tmp_path / "out" / "results.csv").read_bytes() == before
-    written(lists[0], "photo,x0,y0,x1,y1", *rows)
-    assert register("--list", lists[0], bank) == 0
+    written(first, header, *rows)
+    assert register("--list", first, bank) == 0
     assert len(table(tmp_path / "out")) == 2, "a longer list goes on"
 
 
 def test_demo_plot_and_bank_overwrite_no_file_of_others(folder, refused, tmp_path):
     for name in ("mesh.ply", "photo.png", "plot.png", "plot.svg", "bank.safetensors"):
         (tmp_path / name).write_text("of others")
-    refused(
-        main(["demo", "--out", str(tmp_path), "--quiet"]), "mesh.ply: not written by this command"
-    )
-    files = [str(folder / "photos" / "0.png"), str(folder / "truck.safetensors")]
-    for name in ("plot.png", "plot.svg"):
-        out = ["--out", str(tmp_path / name), "--quiet"]
-        refused(main(["plot", "overlay", *files, "--box", *box_of(0), *out]), f"{name}: exists")
-    mine = [
-        "plot",
-        "viewpoints",
-        *files,
-        "--box",
-        *box_of(0),
-        "--out",
-        str(tmp_path / "mine.png"),
-        "--quiet",
-    ]
-    assert (main(mine), main(mine)) == (0, 0)
     photo = tmp_path / "shot.png"
-    shutil.copy(files[0], photo)
-    refused(
-        main(["plot", "overlay", str(photo), files[1], "--out", str(photo)]), "shot.png: an input"
-    )
-    bank = ["bank", str(folder / "truck.ply"), "--quiet", "--out"]
-    refused(main([*bank, str(tmp_path / "bank.safetensors")]), "bank.safetensors: exists")
+    shutil.copy(folder / "photos" / "0.png", photo)
+
+    def run(command, *words, out):
+        return main([*command.split(), *map(str, words), "--out", str(tmp_path / out), "--quiet"])
+
+    files = [photo, folder / "truck.safetensors", "--box", *box_of(0)]
+    refused(run("demo", out=""), "mesh.ply: not written by this command")
+    for name in ("plot.png", "plot.svg"):
+        refused(run("plot overlay", *files, out=name), f"{name}: exists")
+    for _ in range(2):
+        assert run("plot viewpoints", *files, out="mine.png") == 0
+    refused(run("plot overlay", *files[:2], out="shot.png"), "shot.png: an input")
+    refused(run("bank", folder / "truck.ply", out="bank.safetensors"), "bank.safetensors: exists")
     assert {path.read_text() for path in tmp_path.glob("[bp]*") if path.name != "mine.png"} == {
         "of others"
     }
@@ -179,17 +126,16 @@ FAILURES = {
 
 
 @pytest.mark.parametrize("words", FAILURES.values(), ids=FAILURES.keys())
-def test_a_photograph_that_fails_leaves_no_result_of_another(folder, register, tmp_path, words):
+def test_a_photograph_that_fails_leaves_no_result_of_another(register_one, tmp_path, words):
     """A robot would read the old pose."""
-    given = ["--box", *box_of(0), "--format", "ros"]
+    given = ["--no-refine", "--format", "ros"]
     camera = ["--camera", *CAMERA]
-    first = [folder / "photos" / "0.png", folder / "truck.safetensors"]
-    assert register(*first, *given, *camera) == 0
+    assert register_one(*given, *camera) == 0
     out = tmp_path / "out"
     names = {path.name for path in out.iterdir()}
     assert names >= {"result.json", "overlay.png", "pose.glb", "pose.yaml", "tf.yaml"}
     photo, mesh, *options = words
-    assert register(folder / photo, folder / mesh, *given, *(options or camera)) == 2
+    assert register_one(*given, *(options or camera), photo=photo, mesh=mesh) == 2
     assert {path.name for path in out.iterdir()} == {MARKER}
 
 

@@ -34,16 +34,8 @@ def rig(tmp_path_factory):
 
 
 def register(folder, rig, out, *words):
-    command = [
-        "register",
-        "--views",
-        str(rig),
-        str(folder / "learned.safetensors"),
-        "--quiet",
-        "--out",
-        str(out),
-    ]
-    return main([*command, *words])
+    files = ["--views", str(rig), str(folder / "learned.safetensors"), "--out", str(out)]
+    return main(["register", *files, "--quiet", *words])
 
 
 def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, capsys):
@@ -53,17 +45,12 @@ def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, capsys):
     document = json.loads((tmp_path / "result.json").read_text())
     check_pose(document, WORLD, 1.5, SHARE)
     assert (document["frame"], document["T_cam_from_model"]) == ("world", None)
-    assert [view["photo"] for view in document["photographs"]] == [
-        str(place / row[0]) for row in [*rows, ["none.png"]]
-    ]
-    assert [view["failure"] is None for view in document["photographs"]] == [
-        True,
-        True,
-        True,
-        False,
-    ]
-    assert "no such file" in document["photographs"][3]["failure"]
-    assert document["photographs"][0]["camera"]["matrix"][0] == [260.0, 0.0, 119.5]
+    views = document["photographs"]
+    names = [row[0] for row in rows]
+    assert [view["photo"] for view in views] == [str(place / name) for name in [*names, "none.png"]]
+    assert [view["failure"] is None for view in views] == [True] * 3 + [False]
+    assert "no such file" in views[3]["failure"]
+    assert views[0]["camera"]["matrix"][0] == [260.0, 0.0, 119.5]
     w, *xyz = document["quaternion"]
     R = Rotation.from_quat([*xyz, w]).as_matrix()
     assert pytest.approx(torch.tensor(document["rotation"]).numpy(), abs=1e-6) == R
@@ -108,14 +95,7 @@ def test_read_rig_reads_colmap_and_bop(rig, tmp_path):
         for view, R, row in zip(views, expected, rows, strict=True):
             torch.testing.assert_close(view.T_cam_from_world[:3, :3], R, atol=1e-6, rtol=0)
             assert view.T_cam_from_world[:3, 3].tolist() == pytest.approx(row[18:], abs=1e-6)
-            assert view.camera.matrix[:2].flatten().tolist() == [
-                260.0,
-                0.0,
-                119.5,
-                0.0,
-                260.0,
-                89.5,
-            ]
+            assert view.camera.matrix[:2].tolist() == [[260.0, 0.0, 119.5], [0.0, 260.0, 89.5]]
     model = tmp_path / "sparse" / "0"  # where COLMAP writes it
     model.mkdir(parents=True)
     for name in ("images.txt", "cameras.txt"):

@@ -33,27 +33,12 @@ def test_bop_dataset_counts_skipped_items_and_returns_documented_samples(tree):
     assert dict(dataset.skipped) == reasons
     assert dataset.skipped_items["missing_image"] == ["test/000001/4 #0"]
     sample = dataset[0]
-    assert set(sample) == {
-        *(
-            "image",
-            "image_path",
-            "box",
-            "box_visible",
-            "camera_matrix",
-            "rotation",
-            "translation",
-            "T_cam_from_world",
-        ),
-        *(
-            "obj_id",
-            "scene_id",
-            "image_id",
-            "instance_index",
-            "visib_fract",
-            "model_path",
-            "model_info",
-        ),
-    }
+    names = """
+        image image_path box box_visible camera_matrix rotation translation
+        T_cam_from_world obj_id scene_id image_id instance_index visib_fract
+        model_path model_info
+    """
+    assert set(sample) == set(names.split())
     assert sample["image"].shape == (3, 60, 80)
     assert sample["box"].tolist() == [-5, 4, 25, 24], (
         "x, y, width, height become corners, and may leave the image"

@@ -17,7 +17,7 @@ from curvireg_torch import cli
 from curvireg_torch.geometry import rotation_error, transform
 from curvireg_torch.geometry.cameras import pose_from_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support.numbers import double
+from tests._support.numbers import double, seeded
 
 from .._support import miniature
 from .._support.exif import exif, with_exif
@@ -70,7 +70,7 @@ def files(tmp_path_factory):
     quarter = torch.diag(double([0.25, 0.25, 1.0]))
     K = quarter @ cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0, dtype=torch.float64)
     for seed, (name, azimuth) in enumerate(AZIMUTHS.items()):
-        generator = torch.Generator().manual_seed(seed)
+        generator = seeded(seed)
         picture, _ = synthesize_photograph(
             mesh, pose(azimuth), K, (size[0] // 4, size[1] // 4), generator
         )

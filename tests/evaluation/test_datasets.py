@@ -13,6 +13,7 @@ from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark,
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Registrar
 from tests._support.lists import bop_poses, table
+from tests._support.numbers import double, eye
 from tests._support.small import SMALL, rows_of, run
 
 
@@ -37,8 +38,8 @@ def test_evaluate_pascal3d(pascal, tmp_path):
     assert good["mesh"].endswith("car/01.off")
     assert {"probabilities", "none", "top", "reliable", "confidence"} <= set(good)
     assert good["seconds"]["register"] > 0
-    R = torch.tensor(good["rotation"], dtype=torch.float64)
-    torch.testing.assert_close(R @ R.T, torch.eye(3).double(), atol=1e-6, rtol=0)
+    R = double(good["rotation"])
+    torch.testing.assert_close(R @ R.T, eye(3), atol=1e-6, rtol=0)
     files = {p.name for p in (tmp_path / "out").iterdir()} - {MARKER}
     assert files == {
         "results.jsonl",

@@ -12,15 +12,15 @@ from scipy.spatial.transform import Rotation
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import metrics
 from curvireg_torch.geometry import rotation_error
-from tests._support.numbers import double
+from tests._support.numbers import double, eye, seeded
 from tests._support.poses import poses, rotations
 
 K = double([[600.0, 0.0, 320.0], [0.0, 620.0, 240.0], [0.0, 0.0, 1.0]])
-POINTS = torch.rand(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+POINTS = torch.rand(40, 3, generator=seeded(0), dtype=torch.float64) - 0.5
 GT = poses(5, 1)
 EST = poses(5, 2, near=GT)
 R = rotations(5, 0)
-SYMMETRIES = torch.eye(3, dtype=torch.float64)[None]
+SYMMETRIES = eye(3)[None]
 
 
 def _move(T, points=POINTS):
@@ -40,7 +40,7 @@ def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict():
     for values, median in (([1.0, 2.0, torch.inf], 2.0), ([1.0, torch.inf, torch.inf], math.inf)):
         assert metrics.median_error(torch.tensor(values)) == median
     for n in (1, 6, 7):
-        values = 180.0 * torch.rand(n, generator=torch.Generator().manual_seed(n))
+        values = 180.0 * torch.rand(n, generator=seeded(n))
         assert metrics.median_error(values) == pytest.approx(float(np.median(values.numpy())))
     errors = torch.tensor([0.0, 0.07, 0.26, 0.50, torch.inf])
     # Thresholds 0.05, 0.10, ..., 0.50: the errors pass 10, 9, 5, 0 (0.5 is not below 0.5) and 0 of
@@ -115,7 +115,7 @@ def test_add_and_adds_against_loops():
 
 
 def test_mssd_and_mspd_against_loops(monkeypatch):
-    symmetries = torch.stack([torch.eye(4, dtype=torch.float64), *poses(3, 5)])
+    symmetries = torch.stack([eye(4), *poses(3, 5)])
     symmetries[:, :3, 3] *= 0.02
     cameras = K.repeat(5, 1, 1)
     cameras[:, 0, 0] += 50.0 * torch.arange(5)
@@ -141,13 +141,11 @@ def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(
 ):
     """Scores of cans with 315 symmetries took minutes."""
     angles = torch.arange(315.0, dtype=torch.float64) * (2 * math.pi / 315)
-    symmetries = torch.eye(4, dtype=torch.float64).repeat(315, 1, 1)
+    symmetries = eye(4).repeat(315, 1, 1)
     symmetries[:, :2, :2] = torch.stack(
         [angles.cos(), -angles.sin(), angles.sin(), angles.cos()], 1
     ).view(-1, 2, 2)
-    points = (
-        torch.rand(6000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
-    )
+    points = torch.rand(6000, 3, generator=seeded(0), dtype=torch.float64) - 0.5
     moved = []
     transform = metrics._transform
     counted = lambda T, points: moved.append(len(T) * len(points)) or transform(T, points)  # noqa: E731
@@ -229,9 +227,9 @@ def test_the_largest_distance_of_one_pose_is_that_of_all_points():
     """The point that moves farthest is none of those that bound the maximum."""
     points = torch.zeros(2 * metrics.BOUNDING_POINTS, 3, dtype=torch.float64)
     points[1] = torch.tensor([1.0, 0.0, 0.0])
-    quarter = torch.eye(4, dtype=torch.float64)[None].clone()
+    quarter = eye(4)[None].clone()
     quarter[0, :2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
-    identity = torch.eye(4, dtype=torch.float64)[None].clone()
+    identity = eye(4)[None].clone()
     for pose in (quarter, identity):
         pose[0, 2, 3] = 2.0
     assert float(metrics.mssd_error(quarter, identity, points)) == pytest.approx(math.sqrt(2))

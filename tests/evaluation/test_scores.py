@@ -16,6 +16,7 @@ from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_view
 from curvireg_torch.jobs.store import ResultStore, to_json
 from tests._support.lists import bop_poses, table
 from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
+from tests._support.numbers import double
 
 SECONDS = {"bank": 2.0, "register": 0.5}
 PICTURE = {"width": 80, "height": 60}
@@ -119,7 +120,7 @@ def test_pascal3d_summary(furniture, tmp_path):
 
 
 def test_pascal3d_table(furniture, tmp_path):
-    R = rotation_from_viewpoint(*torch.tensor([200.0, 10, -5]).double()).tolist()
+    R = rotation_from_viewpoint(*double([200.0, 10, -5])).tolist()
     scores_of(furniture, tmp_path, [{"rotation": R}, FAILED] + [{"skipped": "x"}] * 7)
     first, second = table(tmp_path, "predictions.csv")
     assert (first["category"], first["image_id"], first["truncated"]) == ("bottle", "1", "0")
@@ -340,7 +341,7 @@ def test_errors_are_written_with_all_digits(instances, tmp_path):
     assert found[2]["add"] == "inf"
     assert summary["ar_rgb"] == pytest.approx((summary["mssd_ar"] + summary["mspd_ar"]) / 2)
     assert "VSD needs depth" in summary["vsd"]
-    web = {"error_deg": torch.tensor([1 / 3, torch.nan], dtype=torch.float64)}
+    web = {"error_deg": double([1 / 3, torch.nan])}
     groups = [{"obj_id": 1}, {"obj_id": 2}]
     benchmark.write_errors(tmp_path / "web.csv", ["a", "b"], groups, web)
     assert [row["error_deg"] for row in table(tmp_path, "web.csv")] == [repr(1 / 3), ""]

@@ -14,6 +14,7 @@ from curvireg_torch.features import backbone
 from curvireg_torch.features.backbone import Backbone, describe, similarity
 from curvireg_torch.synthetic import procedural_background
 from curvireg_torch.utils.files import tensor_checksum
+from tests._support.numbers import seeded
 
 from .._support.layer_contract import LayerCase, LayerContract
 from ..filters.layer_cases import colour_photos, photos
@@ -141,7 +142,7 @@ def test_weights_are_read_where_the_cache_cannot_be_written(kept):
 
 
 def test_similarity_is_the_mean_cosine_of_the_cells(network):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     pictures = torch.stack([procedural_background((64, 64), generator) for _ in range(3)])
     expected = torch.zeros(3, 3)
     for features, spread in zip(network(pictures), network.spreads, strict=True):
@@ -157,7 +158,7 @@ def test_similarity_is_the_mean_cosine_of_the_cells(network):
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("count", [2, 5, 16, 19])
 def test_the_descriptor_of_an_image_does_not_depend_on_the_others(network, count, channels):
-    images = torch.rand(count, channels, 64, 64, generator=torch.Generator().manual_seed(0))
+    images = torch.rand(count, channels, 64, 64, generator=seeded(0))
     alone = torch.cat([describe(images[k : k + 1], network) for k in (0, 1, count - 1)])
     assert torch.equal(describe(images, network)[[0, 1, count - 1]], alone)
 

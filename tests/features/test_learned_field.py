@@ -14,6 +14,7 @@ from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.features import LearnedCurvilinearSaliency, doubled_angle, halved_angle
 from curvireg_torch.features.backbone import Backbone, describe
 from curvireg_torch.features.learned_field import FieldNetwork, save_weights
+from tests._support.numbers import seeded
 
 from .._support.layer_contract import LayerCase, LayerContract
 from .._support.quick import slow_after
@@ -116,7 +117,7 @@ def test_learned_field_of_a_square_is_its_outline(field):
     ),
 )
 def test_learned_field_with_weights_of_another_dtype(field, dtype, channels):
-    x = torch.rand(2, channels, 60, 100, generator=torch.Generator().manual_seed(0))
+    x = torch.rand(2, channels, 60, 100, generator=seeded(0))
     converted = LearnedCurvilinearSaliency().to(dtype)
     assert {p.dtype for p in converted.parameters()} == {dtype}
     precision = 0.05 if dtype is not torch.float64 else 1e-5
@@ -131,12 +132,12 @@ def test_learned_field_with_weights_of_another_dtype(field, dtype, channels):
 
 def test_learned_field_of_double_weights_reads_double_images():
     converted = LearnedCurvilinearSaliency().double()
-    x = torch.rand(1, 3, 60, 60, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x = torch.rand(1, 3, 60, 60, generator=seeded(0), dtype=torch.float64)
     assert not torch.equal(converted(x), converted(x.float().double()))
 
 
 def test_learned_field_under_autocast(field):
-    x = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    x = torch.rand(1, 3, 64, 64, generator=seeded(0))
     with torch.autocast("cpu", dtype=torch.bfloat16):
         out = field(x)
     assert out.dtype == torch.float32
@@ -154,7 +155,7 @@ def test_learned_field_does_not_enlarge_slivers(shape):
 
 
 def test_fields_fill_missing_pixels():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     image = torch.rand(1, 3, 64, 64, generator=generator)
     lost = image.clone()
     lost[0, :, 30:34, 30:34], lost[0, 2, 5, 5] = math.nan, math.inf

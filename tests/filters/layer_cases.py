@@ -4,6 +4,7 @@ contract."""
 import torch
 
 from curvireg_torch import features, filters
+from tests._support.numbers import seeded
 
 from .._support.layer_contract import LayerCase
 
@@ -37,7 +38,7 @@ def plane(size, slope_x, slope_y, distance):
 
 def depths(n=2, size=24, *, seed=0, dtype=torch.float32):
     """Rough surfaces inside a disc, background 0."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     z = 2.0 + torch.rand(n, 1, size, size, generator=generator, dtype=torch.float64)
     z = filters.gaussian_smooth(z, 2.0)
     x, y = grid(size) if size % 2 else (g[1:, 1:] for g in grid(size + 1))
@@ -46,7 +47,7 @@ def depths(n=2, size=24, *, seed=0, dtype=torch.float32):
 
 def photos(n=2, size=24, *, seed=0, dtype=torch.float32):
     """Smooth noise with a bright box, in [0, 1]."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     x = filters.gaussian_smooth(
         torch.rand(n, 1, size, size, generator=generator, dtype=torch.float64), 1.0
     )

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from curvireg_torch import filters
-from tests._support.numbers import double
+from tests._support.numbers import double, seeded
 
 from .layer_cases import cylinder, grid, plane, sphere
 
@@ -183,7 +183,7 @@ FIELDS = {
 def test_depth_layers_ignore_noise_of_one_ulp(field, distance):
     depth = torch.zeros(2, 1, 96, 96)
     depth[..., 30:70, 25:75] = distance
-    half = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) < 0.5
+    half = torch.rand(depth.shape, generator=seeded(0)) < 0.5
     noisy = depth.nextafter(torch.tensor(math.inf)).where(half & (depth > 0), depth)
     # the sign of each vector is arbitrary
     a = FIELDS[field](noisy).double()

@@ -11,6 +11,7 @@ from skimage.feature import hessian_matrix_eigvals
 from curvireg_torch import filters
 from curvireg_torch.filters.curvilinear import dominant_eigenvector, scaled_direction
 from curvireg_torch.filters.operations import central_derivatives, smooth
+from tests._support.numbers import double, eye, seeded
 
 from .layer_cases import depths, photos
 
@@ -146,15 +147,15 @@ def test_gaussian_gradient_saliency_and_second_derivatives_against_scipy_and_loo
 def test_dominant_eigenvector_against_lapack():
     """(N, 2, 2) with real eigenvalues: adj(I_P) H_Z of random surfaces, and the boundaries between
     branches."""
-    g = torch.Generator().manual_seed(0)
+    g = seeded(0)
     slope, h = (2 * torch.randn(500, n, generator=g, dtype=torch.float64) for n in (2, 3))
     across = torch.stack([slope[:, 1], -slope[:, 0]], dim=1)
-    adjugate = torch.eye(2, dtype=torch.float64) + across[:, :, None] * across[:, None]
+    adjugate = eye(2) + across[:, :, None] * across[:, None]
     general = adjugate @ h[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     # equal diagonal (a ridge), or trace 0
     symmetric = [-1, 2, 2, -1], [1, 2, 2, 1], [-1, 2, 2, 1], [1, -2, -2, -1]
     triangular = [0, 3, 0, 1], [0, 0, 3, -1], [2, 3, 0, -1], [0, 0, 0, -5], [-5, 0, 0, 0]
-    special = torch.tensor([*symmetric, *triangular], dtype=torch.float64)
+    special = double([*symmetric, *triangular])
     m = torch.cat([general, special.view(-1, 2, 2)])
     planes = [m[:, i, j].view(-1, 1, 1, 1) for i in range(2) for j in range(2)]
     vx, vy, half_gap = dominant_eigenvector(*planes)

@@ -9,9 +9,10 @@ from curvireg_torch.fitting.edges import CROP_SIZE, EdgeCrops
 from curvireg_torch.fitting.measured_fit import contour_evidence, contour_support
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.rendering.contours import MeshContours
+from tests._support.numbers import double, eye, seeded
 
-K = torch.tensor([[4000.0, 0.0, 99.5], [0.0, 4000.0, 99.5], [0.0, 0.0, 1.0]]).double()
-FRONT = transform(torch.eye(3).double(), torch.tensor([0.0, 0.0, 40.0]).double())
+K = double([[4000.0, 0.0, 99.5], [0.0, 4000.0, 99.5], [0.0, 0.0, 1.0]])
+FRONT = transform(eye(3), double([0.0, 0.0, 40.0]))
 BOX = torch.tensor([[40.0, 40.0, 160.0, 160.0]])
 
 
@@ -34,7 +35,7 @@ def photograph(*, line=0.0, noise=0.0):
     image = torch.full((3, 200, 200), 0.2)
     image[:, 50:150, 50:150] = 0.8
     image[:, 50:150, 100:150] -= line
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     return (image + noise * torch.randn(image.shape, generator=generator)).clamp(0.0, 1.0)
 
 

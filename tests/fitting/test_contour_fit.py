@@ -20,7 +20,7 @@ from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.terms import crop_photographs
-from tests._support.numbers import double
+from tests._support.numbers import double, eye, seeded
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, fitted, noise, pose, silhouette
 
 CENTRE = double([0.2, -0.1, 0.3])
@@ -51,7 +51,7 @@ def problem(distances, heights):
 
 
 def state(count, valid=None):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     model = CENTRE + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
     normals = F.normalize(
         torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1
@@ -121,7 +121,7 @@ def test_edge_strength_peaks_on_a_slanted_edge():
     across = edges.strength(here, n, offsets, FIRST)[0, 0]
     assert int(across.argmax()) == 5
     assert float(across[0]) < 0.1 * float(across[5])
-    along = edges.strength(here, n.flip(-1) * torch.tensor([-1.0, 1.0]).double(), offsets, FIRST)
+    along = edges.strength(here, n.flip(-1) * double([-1.0, 1.0]), offsets, FIRST)
     assert along.max() < 0.01
     assert edges.strength(here + 500, n, offsets, FIRST).max() == 0
 
@@ -143,9 +143,9 @@ def test_edges_outside_the_photograph_do_not_count():
     """A crop whose right half repeats the border of the photograph."""
     inside = torch.zeros(1, 1, 64, 64)
     inside[..., :32] = 1.0
-    edges = EdgeField(torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0)), inside)
+    edges = EdgeField(torch.rand(1, 3, 64, 64, generator=seeded(0)), inside)
     uv = double([[[10.0, 20.0], [12.0, 40.0], [50.0, 20.0]]])
-    n = torch.tensor([1.0, 0.0]).double().expand(1, 3, 2)
+    n = double([1.0, 0.0]).expand(1, 3, 2)
     valid = torch.ones(1, 3, dtype=torch.bool)
     assert (edges.strength(uv, n, torch.zeros(1).double(), FIRST)[0, :, 0] > 0).tolist() == [
         True,
@@ -180,8 +180,8 @@ def row_of_points(outline, direction, *, count=1):
 
 def test_mask_weights_within_at_the_border_and_beyond_in_the_crop_of_each_pose():
     """At 20 px to the left of the border, on it, and at 20 px to the right."""
-    uv = torch.tensor([[[127.5, 90.0]]]).double()
-    offsets = torch.tensor([-20.0, 0.0, 20.0]).double()
+    uv = double([[[127.5, 90.0]]])
+    offsets = double([-20.0, 0.0, 20.0])
     # at the second the object lies outside
     outlines = (True, 1.0, [0.6, 2.0, 0.6]), (True, -1.0, [0.6, 0.6, 0.6])
     for outline, direction, expected in (
@@ -233,7 +233,7 @@ def test_mask_weights_steps_and_comparison_and_not_the_reported_support():
 @pytest.mark.parametrize("seed", range(4))
 def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
     mesh = example_mesh()
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     size = (360, 480)
     camera = camera_matrix(600.0, 600.0, 239.5, 179.5, dtype=torch.float64)
     truth = random_pose(mesh, camera, size, generator, elevations=(10.0, 50.0))
@@ -250,7 +250,7 @@ def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
     R = fit.transform[0, :3, :3]
     assert rotation_error(R, truth[:3, :3]) < 0.6
     assert ((fit.transform[0, :3, 3] - truth[:3, 3]).norm() / truth[:3, 3].norm()) < 0.01
-    torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(R @ R.T, eye(3))
     C = fit.covariance[0]
     assert torch.linalg.eigvalsh(C).min() > 0
     assert 0.001 < torch.rad2deg(C.diagonal()[:3].sqrt()).max() < 5.0
@@ -297,7 +297,7 @@ def test_a_grey_photograph_counts_as_three_equal_channels():
 def several():
     """Three photographs of the cube with their own sizes and cameras, and five starts: two, two and
     one, shuffled."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     images = []
     boxes = []
     cameras = []
@@ -424,9 +424,7 @@ def test_known_short_fits_change_nothing_and_fitted_poses_are_kept():
     image = silhouette(cube(), CUBE_POSE)
     contours = MeshContours(cube())
     crops = EdgeCrops.cut([image], BOX[None], 0.1)
-    starts = apply_twist(
-        CUBE_POSE.repeat(2, 1, 1), torch.deg2rad(torch.eye(6).double()[:2] * 6), contours.centre
-    )
+    starts = apply_twist(CUBE_POSE.repeat(2, 1, 1), torch.deg2rad(eye(6)[:2] * 6), contours.centre)
     problem = contours, crops, K.expand(2, 3, 3)
     first = fit_to_edges(*problem, starts, FIRST.repeat(2))
     known = fit_to_edges(

@@ -13,7 +13,7 @@ from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import synthesize_photograph
-from tests._support.numbers import double
+from tests._support.numbers import double, eye, seeded
 from tests._support.scenes import CAMERA, SIZE
 
 TURN = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
@@ -36,7 +36,7 @@ def compared(*, shift=0.0, unit=1.0, wrong=0.0):
     radius = mesh_radius(mesh)
     R = rotation_from_viewpoint(35.0, 30.0, 0.0).double()
     T = transform(R, radius * torch.tensor([shift, 0.0, 5.0]).double())
-    image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, torch.Generator().manual_seed(1))
+    image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(1))
     crops = EdgeCrops.cut([image], box[None], 0.1)
     again = T.clone()
     again[0, 3] += wrong * radius
@@ -86,9 +86,9 @@ def test_contours_that_are_not_there_count_against_their_pose():
     """The photograph shows a plain box: the pose whose mark lies below is better."""
     box_alone = trimesh.creation.box((200, 120, 80))
     R = rotation_from_viewpoint(35.0, 30.0, 0.0).double()
-    T = transform(R, mesh_radius(marked_box()) * torch.tensor([0.0, 0.0, 5.0]).double())
+    T = transform(R, mesh_radius(marked_box()) * double([0.0, 0.0, 5.0]))
     background = torch.full((3, *SIZE), 0.5)
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     image, box = synthesize_photograph(
         box_alone, T, CAMERA, SIZE, generator, background=background, texture=0.0
     )
@@ -130,7 +130,7 @@ def closed_case(
     monkeypatch.setattr(details.ContourProblem, "of", lambda *_: problem)
     monkeypatch.setattr(details, "pixels", lambda *_: uv)
     nothing = None
-    T = torch.eye(4).double().repeat(2, 1, 1)
+    T = eye(4).repeat(2, 1, 1)
     scores, differ = details.compare_details(nothing, nothing, nothing, T, nothing)
     torch.testing.assert_close(scores, -scores.T)
     assert torch.equal(differ, differ.T)
@@ -192,7 +192,7 @@ def test_points_near_a_contour_outside_the_photograph_are_not_alone(monkeypatch)
 
 
 def test_pairs_of_many_photographs_are_compared_as_each_alone():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     uv = 60.0 * torch.rand(5, 40, 2, generator=generator).double()
     strength = torch.rand(5, 40, generator=generator).double()
     valid = torch.rand(5, 40, generator=generator) < 0.8

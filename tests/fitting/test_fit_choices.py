@@ -11,7 +11,7 @@ from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.rendering.contours import MeshContours
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, silhouette
 
 
@@ -119,7 +119,7 @@ class Half:
     ],
 )
 def test_the_next_best_fit_is_another_pose(x, support, expected):
-    T = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
+    T = eye(4).repeat(4, 1, 1)
     T[:, 0, 3] = double(x)
     points = torch.zeros(4, 1)
     fits = ContourState(T, T, points)

@@ -14,7 +14,7 @@ from curvireg_torch.fitting.measured_fit import FULL_SIZE_RADII
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.geometry.cameras import projected
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support.numbers import double
+from tests._support.numbers import double, seeded
 from tests._support.scenes import SIZE, scene, truck_registrar
 
 NEAR = camera_matrix(150.0, 150.0, 119.5, 89.5)  # a wide angle, from where perspective is strong
@@ -27,9 +27,7 @@ def near_scene():
     T[:3, 3] += torch.tensor([0.0, 0.0, 3.0 * truck_registrar().describer.radius]) - (
         T[:3, :3] @ centre + T[:3, 3]
     )
-    image, box = synthesize_photograph(
-        example_mesh(), T, NEAR, SIZE, torch.Generator().manual_seed(5)
-    )
+    image, box = synthesize_photograph(example_mesh(), T, NEAR, SIZE, seeded(5))
     return image, box, T
 
 

@@ -24,7 +24,7 @@ from curvireg_torch.registration.hypotheses import fit_poses, placed
 from curvireg_torch.registration.photograph import as_photographs
 from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background
-from tests._support.numbers import double
+from tests._support.numbers import double, eye, seeded
 from tests._support.quick import slow_after
 
 SIZE = (360, 480)
@@ -77,11 +77,11 @@ def pose(azimuth, x, z):
 
 def photograph(*poses, shown=None):
     """(3, H, W) meshes in dim light, in front of clutter."""
-    image = procedural_background(SIZE, torch.Generator().manual_seed(3))
+    image = procedural_background(SIZE, seeded(3))
     for T in poses:
         picture = render_colour(shown or mesh(), T[None], K[None], SIZE)[0]
         image = torch.where(picture.amin(dim=0) < 0.999, 0.7 * picture + 0.05, image)
-    noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+    noise = torch.randn(image.shape, generator=seeded(0))
     return (image + 0.02 * noise).clamp(0, 1)
 
 
@@ -161,10 +161,7 @@ def test_keypoints_agree_with_the_poses_of_their_object():
     other = pose(150.0, 0.9, 4.5)
     matches = keypoints().matches(photograph(T, other), K)
     off = torch.stack(
-        [
-            apply_twist(T[None], twist[None], mesh_centre(mesh()))[0]
-            for twist in 0.4 * torch.eye(6).double()
-        ]
+        [apply_twist(T[None], twist[None], mesh_centre(mesh()))[0] for twist in 0.4 * eye(6)]
     )
     counts = matches.agreeing(torch.stack([T, other, *off]))
     assert counts[:2].min() >= FitSettings().min_keypoints

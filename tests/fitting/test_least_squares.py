@@ -14,7 +14,7 @@ from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.rendering.contours import ContourPoints
-from tests._support.numbers import double
+from tests._support.numbers import double, eye, seeded
 from tests.fitting.cube import K, fitted, pose, silhouette
 
 ZERO = torch.zeros(3, dtype=torch.float64)
@@ -54,7 +54,7 @@ def test_long_steps_are_shortened(rotation, translation, fraction):
     T = pose([0.0, 0.0, 0.0], [0.0, 0.0, 6.0])[None]
     centre = double([0.0, 0.0, 0.5])
     step = double([[*rotation, *(6.5 * t for t in translation)]])
-    A = torch.eye(6, dtype=torch.float64)[None]
+    A = eye(6)[None]
     torch.testing.assert_close(
         ls.least_squares_step(A, step[..., None], T, centre, 0.0), fraction * step
     )
@@ -70,9 +70,7 @@ def test_damping_shortens_each_direction_alike():
 def test_points_need_a_minimum_of_matches():
     T = pose([0.0] * 3, [0.0, 0.0, 6.0])[None]
     truth = pose([0.02, 0.0, 0.01], [0.05, 0.0, 6.1])[None]
-    points = (
-        torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
-    )
+    points = torch.rand(1, 20, 3, generator=seeded(0), dtype=torch.float64) - 0.5
     uv = ls.pixels(points, truth, K[None], ZERO)
     for count, expected in ((ls.MIN_MATCHES - 1, T), (ls.MIN_MATCHES, truth)):
         weight = (torch.arange(20) < count).double()[None]
@@ -94,14 +92,14 @@ def test_inlier_ratio_counts_all_points():
 def test_matches_are_measured_along_x_and_y_of_the_image():
     """Of three points, one 0.5 px too far to the right in the image, and one 1 px too low."""
     T = pose([0.1, 0.2, 0.0], [0.0, 0.0, 6.0])[None]
-    points = torch.rand(1, 3, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
+    points = torch.rand(1, 3, 3, generator=seeded(0)).double() - 0.5
     uv = ls.pixels(points, T, K[None], ZERO)
     uv[0, 0, 0] += 0.5
     uv[0, 2, 1] += 1.0
-    weight = torch.tensor([[1.0, 0.5, 1.0]]).double()
+    weight = double([[1.0, 0.5, 1.0]])
     matches = ls.PointMatches(points, uv, weight)
     found = matches.measurements(T, K[None], ZERO, 2.0)
-    expected = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 1.0]).double()
+    expected = double([0.5, 0.0, 0.0, 0.0, 0.0, 1.0])
     torch.testing.assert_close(found.distance.flatten(), expected)
     robust = torch.tensor([(1 + 1 / 16) ** -2, 0.5, (1 + 1 / 4) ** -2]).double()
     torch.testing.assert_close(found.weight.flatten(), robust.repeat_interleave(2))
@@ -123,7 +121,7 @@ def test_nearest_rigid_pose_is_orthogonal():
 def cloud(count):
     """Points in a cube with random normals, a pose, the cube's centre, and the derivatives along
     the normals."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     T = pose([0.3, -0.5, 0.2], [-1.6, -0.4, 6.0])[None]
     centre = double([2.0, 0.5, 0.6])
     model = centre + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
@@ -138,7 +136,7 @@ def cloud(count):
 def test_covariance_in_closed_form():
     """Directly in (w, e), from autograd's derivative of R = exp([w]x) R0, t = t0 + e."""
     points, T, centre, J = cloud(60)
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     W, d = (torch.rand(1, 60, 1, generator=generator, dtype=torch.float64) for _ in range(2))
     C, known = ls.pose_covariance(ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
     assert int(known) == 6
@@ -198,9 +196,9 @@ def test_covariance_follows_the_unit_of_the_mesh(unit, across):
     """Also of what is unknown: with normals along x alone, the translation along y."""
     points, T, centre, J = cloud(60)
     if across:
-        points = replace(points, normals=torch.tensor([1.0, 0.0]).double().expand(1, 60, 2))
+        points = replace(points, normals=double([1.0, 0.0]).expand(1, 60, 2))
         _, J = ls.project(points.model, points.normals, T, K[None], centre)
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     W, d = (torch.rand(1, 60, 1, generator=generator, dtype=torch.float64) for _ in range(2))
     C, known = ls.pose_covariance(ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
     scaled = T.clone()

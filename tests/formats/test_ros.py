@@ -11,6 +11,7 @@ from curvireg_torch.data.poses import read_pose
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.formats.exports.ros import FILES, ros_covariance, time_stamp, write_ros
 from curvireg_torch.geometry import rotation_from_axis_angle
+from tests._support.numbers import double, seeded
 
 DOCUMENT = {
     "translation": [1000.0, -2000.0, 500.0],
@@ -53,7 +54,7 @@ def test_several_photographs_are_in_the_world(tmp_path):
 
 def test_the_covariance_is_that_of_disturbed_poses(tmp_path):
     """Of positions in m first, then of rotations about fixed axes: measured on samples."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     factor = torch.randn(6, 6, dtype=torch.float64, generator=generator) * 0.01
     factor[3:] *= 100.0  # mm
     ours = factor @ factor.T
@@ -61,7 +62,7 @@ def test_the_covariance_is_that_of_disturbed_poses(tmp_path):
     covariance = np.array(found["pose"]["covariance"]).reshape(6, 6)
     noise = torch.randn(40_000, 6, dtype=torch.float64, generator=generator) @ factor.T
     t = (torch.tensor(DOCUMENT["translation"]) + noise[:, 3:]) / 1000.0
-    R = rotation_from_axis_angle(torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64))
+    R = rotation_from_axis_angle(double([0.3, -1.0, 2.0]))
     turned = rotation_from_axis_angle(noise[:, :3]) @ R
     skew = turned @ R.T
     turns = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=1)

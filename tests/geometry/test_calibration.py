@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import Camera, camera_matrix, project_points, undistorted
-from tests._support.numbers import double
+from tests._support.numbers import double, eye, seeded
 
 SIZE = (120, 160)
 MATRIX = camera_matrix(110.0, 112.0, 77.0, 61.0)
@@ -20,7 +20,7 @@ FISHEYE = Camera(MATRIX, (0.02, -0.01, 0.003, -0.001), "fisheye", SIZE)
 
 @pytest.mark.parametrize("camera", [RADIAL, TILTED, FISHEYE], ids=["radial", "tilted", "fisheye"])
 def test_photograph_and_box_are_undistorted_as_by_opencv(camera):
-    image = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
+    image = torch.rand(3, *SIZE, generator=seeded(0))
     box = torch.tensor([12.0, 8, 150, 100])
     K = camera.matrix.numpy()
     D = np.array(camera.distortion)
@@ -89,8 +89,8 @@ def test_unusable_cameras_and_boxes_outside_of_what_is_shown_are_refused():
 def test_camera_of_a_resized_photograph():
     small = RADIAL.at((60, 80))
     points = double([[0.3, -0.2, 1.0], [-0.5, 0.4, 2.0]])
-    large = project_points(points, torch.eye(4).double(), MATRIX)
-    pose = torch.eye(4).double()
+    large = project_points(points, eye(4), MATRIX)
+    pose = eye(4)
     # The corner of the picture, (-0.5, -0.5) in px, is the same point in both.
     torch.testing.assert_close(project_points(points, pose, small.matrix), (large + 0.5) / 2 - 0.5)
     assert (small.size, small.distortion) == ((60, 80), RADIAL.distortion)

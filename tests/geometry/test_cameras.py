@@ -9,7 +9,7 @@ from curvireg_torch.geometry.cameras import point_in_cameras, pose_around
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
-from tests._support.numbers import double
+from tests._support.numbers import double, eye, seeded
 
 K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
 
@@ -36,7 +36,7 @@ def test_pose_from_box_recovers_the_true_pose(spread):
     centre = mesh_centre(mesh)
     radius = mesh_radius(mesh)
     hull = extreme_points(mesh)
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     for i in range(25):
         u = torch.rand(3, generator=generator, dtype=torch.float64)
         ray = torch.stack([spread * (2 * u[0] - 1), spread * (2 * u[1] - 1), torch.ones_like(u[0])])
@@ -53,14 +53,14 @@ def test_pose_from_box_keeps_the_object_in_front_of_the_camera():
     cube = torch.cartesian_prod(*[double([-1.0, 1.0])] * 3)
     box = double([-1e5, -1e5, 1e5, 1e5]) + K[:2, 2].repeat(2)
     nearest = 1.05 * 3.0**0.5  # extents of the cube
-    straight = g.pose_from_box(cube, torch.eye(3, dtype=torch.float64), box, K)[1]
+    straight = g.pose_from_box(cube, eye(3), box, K)[1]
     assert float(straight[2]) == pytest.approx(nearest, rel=1e-6)
     rotated = g.rotation_from_viewpoint(20.0, 30.0, 10.0).double()
     assert float(g.pose_from_box(cube, rotated, box, K)[1][2]) > nearest - 1e-6
 
 
 def test_a_pose_around_a_point_has_it_at_the_place():
-    R = g.rotation_from_viewpoint(torch.tensor([30.0, 80.0]).double(), 20.0, 5.0)
+    R = g.rotation_from_viewpoint(double([30.0, 80.0]), 20.0, 5.0)
     point = torch.tensor([0.3, -0.2, 0.5]).double()
     places = torch.tensor([[0.1, 0.2, 3.0], [-0.4, 0.0, 5.0]]).double()
     T = pose_around(R, places, point)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 
 
 def test_opengl_cameras_look_backward_with_y_up():
@@ -62,15 +62,11 @@ HALF_TURN = [-1, 0, 0, 8, 0, -1, 0, 6, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
 def test_symmetry_transforms_reads_matrices_and_axes_and_refuses_malformed_input():
-    assert torch.equal(
-        g.symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None]
-    )
+    assert torch.equal(g.symmetry_transforms({"diameter": 3.0}), eye(4)[None])
     transforms = g.symmetry_transforms({"symmetries_discrete": [HALF_TURN]})
     assert transforms.shape == (2, 4, 4)
     np.testing.assert_array_equal(transforms[1], np.reshape(HALF_TURN, (4, 4)))
-    np.testing.assert_allclose(
-        transforms[1] @ torch.tensor([4.0, 3.0, 7.0, 1.0]).double(), [4.0, 3.0, 7.0, 1.0]
-    )
+    np.testing.assert_allclose(transforms[1] @ double([4.0, 3.0, 7.0, 1.0]), [4.0, 3.0, 7.0, 1.0])
     for info, step, match in (
         ({"symmetries_discrete": [[1.0] * 12]}, 0.1, "expected 16"),
         ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}, 0.1, "length > 0"),

@@ -7,7 +7,7 @@ from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry.crops import check_boxes, crop_squares, image_transforms
 from curvireg_torch.utils.checks import check_camera_matrix
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 
 
 def ramp(height, width):
@@ -20,9 +20,7 @@ def test_image_transforms_invert_crop_transforms_with_exact_zeros():
     # A camera matrix with 1e-16 in place of 0, which some versions of LAPACK leave, is refused.
     squares = double([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]])
     back = image_transforms(squares, 32)
-    torch.testing.assert_close(
-        back @ g.crop_transforms(squares, 32), torch.eye(3).double().expand(2, 3, 3)
-    )
+    torch.testing.assert_close(back @ g.crop_transforms(squares, 32), eye(3).expand(2, 3, 3))
     check_camera_matrix(back)
 
 

@@ -6,6 +6,7 @@ import torch
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import PosePrior, object_frame
+from tests._support.numbers import eye, seeded
 
 
 def rotations(azimuth, elevation=0.0, theta=0.0):
@@ -15,7 +16,7 @@ def rotations(azimuth, elevation=0.0, theta=0.0):
 
 
 def random_rotations(count):
-    a, e, t = torch.rand(3, count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    a, e, t = torch.rand(3, count, generator=seeded(0), dtype=torch.float64)
     return rotations(360.0 * a, 160.0 * e - 80.0, 360.0 * t - 180.0)
 
 
@@ -114,9 +115,7 @@ def test_object_frame_puts_up_on_z_and_the_front_towards_azimuth_zero(up):
                 object_frame(up, front)
             continue
         axes = {
-            s + a: (1.0 - 2.0 * bool(s)) * torch.eye(3).double()[i]
-            for i, a in enumerate("xyz")
-            for s in ("", "-")
+            s + a: (1.0 - 2.0 * bool(s)) * eye(3)[i] for i, a in enumerate("xyz") for s in ("", "-")
         }
         R = object_frame(up, front)
         assert torch.allclose(R @ axes[up], axes["z"], atol=1e-12)

@@ -17,7 +17,7 @@ from curvireg_torch.geometry import (
 )
 from curvireg_torch.geometry.viewpoint import angles_between
 from curvireg_torch.utils.choices import UP_AXES
-from tests._support.numbers import double
+from tests._support.numbers import double, eye, seeded
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint():
 @pytest.mark.parametrize("noise", [0.0, 1e-7, 1e-6, 1e-5, 1e-3])
 def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(elevation, noise):
     """Rotations from an optimiser are rounded, and so not exact."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     azimuth, theta = (
         360.0 * torch.rand(50, 20, generator=generator, dtype=torch.float64) for _ in range(2)
     )
@@ -98,12 +98,8 @@ def test_rotation_error_agrees_with_scipy():
 
 @pytest.mark.parametrize("count", [2, 5, 20, 100, 300, 700])
 def test_uniform_views_has_the_stated_covering_radius(count):
-    probes = torch.randn(
-        100_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
-    probes = torch.nn.functional.normalize(
-        torch.cat([probes, torch.eye(3).double(), -torch.eye(3).double()]), dim=1
-    )
+    probes = torch.randn(100_000, 3, generator=seeded(0), dtype=torch.float64)
+    probes = torch.nn.functional.normalize(torch.cat([probes, eye(3), -eye(3)]), dim=1)
     directions = -uniform_views(count).rotations[:, 2].double()
     nearest = torch.cat([(p @ directions.T).amax(1) for p in probes.split(20_000)])
     radius = math.degrees(math.acos(max(-1.0, float(nearest.min()))))

@@ -33,7 +33,7 @@ from curvireg_torch.matching import ViewBank
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.registration import Registrar
 from curvireg_torch.synthetic import example_mesh
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 from tests._support.quick import slow_after
 
 
@@ -321,7 +321,7 @@ def outcome(error, *, elevation=0.0):
     photograph = GeneratedPhotograph(
         torch.zeros(3, 4, 4, dtype=torch.uint8),
         torch.tensor([0.0, 0, 200, 100]),
-        torch.eye(4, dtype=torch.float64),
+        eye(4),
         trial_camera(),
     )
     return Outcome(photograph, None, error, elevation)

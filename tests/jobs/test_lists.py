@@ -21,6 +21,7 @@ from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import table
+from tests._support.numbers import double, eye
 from tests._support.scenes import SIZE, found_in, scene, two_trucks, unrefined, write_photo
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
@@ -324,11 +325,9 @@ def test_a_long_list_makes_no_tensor_for_each_row(tmp_path, monkeypatch):
 )
 def test_a_start_pose_is_in_the_unit_of_the_mesh(unit, of_mesh, factor):
     """A mesh without a unit is in m; a pose without one is in that of the mesh."""
-    T = torch.eye(4, dtype=torch.float64)
+    T = eye(4)
     T[:3, 3] = torch.tensor([20.0, -10.0, 600.0])
-    moved = torch.tensor(
-        start_in_unit(PoseRecord(T.numpy(), unit=unit), of_mesh), dtype=torch.float64
-    )
+    moved = double(start_in_unit(PoseRecord(T.numpy(), unit=unit), of_mesh))
     torch.testing.assert_close(moved[:3, 3], factor * T[:3, 3])
     assert torch.equal(moved[:3, :3], T[:3, :3])
 

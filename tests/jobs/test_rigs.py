@@ -19,6 +19,7 @@ from curvireg_torch.jobs.rigs import read_rig
 from curvireg_torch.utils.files import only_in
 from tests._support.doubling import check_linear
 from tests._support.lists import written
+from tests._support.numbers import double, eye
 
 POSE = [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1]
 COLUMNS = "photo,camera," + ",".join((*rigs.ROTATION, *rigs.TRANSLATION))
@@ -190,7 +191,7 @@ def test_a_quaternion_begins_with_its_real_part(rig):
     half = 0.5**0.5
     row = ["a.png", "cameras.txt", half, 0, 0, half, 4, 5, 6]
     (view,) = rig(QUATERNION_COLUMNS, row)
-    expected = torch.tensor([[0.0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]]).double()
+    expected = double([[0.0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]])
     torch.testing.assert_close(view.T_cam_from_world, expected)
 
 
@@ -269,7 +270,7 @@ def test_a_photograph_that_does_not_fit_its_camera_leaves_the_others(tmp_path):
     for name, size in rows:
         if size is not None:
             Image.new("RGB", size).save(tmp_path / name)
-        T = torch.eye(4, dtype=torch.float64)
+        T = eye(4)
         views.append(Entry(name=name, photo=tmp_path / name, camera=camera, T_cam_from_world=T))
     first, narrow, missing, last = prepare_views(views)
     assert (first.size, last.size) == ((180, 240), (360, 480))
@@ -289,7 +290,7 @@ def test_rows_of_a_rig_have_the_camera_at_the_size_of_the_photograph(tmp_path, m
             name=name,
             photo=tmp_path / name,
             camera=camera,
-            T_cam_from_world=(number + 1.0) * torch.eye(4, dtype=torch.float64),
+            T_cam_from_world=(number + 1.0) * eye(4),
         )
         for number, name in enumerate(("0.png", "none.png"))
     ]

@@ -24,6 +24,7 @@ from curvireg_torch.pipeline import Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Correlation
 from curvireg_torch.utils.files import tensor_checksum
+from tests._support.numbers import seeded
 from tests._support.scenes import learned_registrar, scene
 
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
@@ -237,9 +238,7 @@ def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
 
 def test_float16_storage_changes_no_ranking(small_bank, saved):
     # Queries differ from views as photographs do: noise of half the descriptors' length.
-    noise = torch.rand(
-        200, small_bank.descriptors.shape[1], generator=torch.Generator().manual_seed(0)
-    )
+    noise = torch.rand(200, small_bank.descriptors.shape[1], generator=seeded(0))
     noise *= 0.5 * small_bank.descriptors.norm(dim=1).mean() / noise.norm(dim=1, keepdim=True)
     queries = small_bank.descriptors[torch.arange(200) % len(small_bank)] + noise
     query = SimpleNamespace(descriptors=queries[:, None])
@@ -302,7 +301,7 @@ def test_the_covariance_counts_a_picture_of_an_orthographic_camera_once(truck, c
     once = sample_views(azimuth_step=40.0, elevations=elevations, distances=[3.0])
     bank = build(truck, views, camera=camera)
     same = build(truck, once, camera=camera)
-    query = torch.rand(3, bank.descriptors.shape[1], generator=torch.Generator().manual_seed(0))
+    query = torch.rand(3, bank.descriptors.shape[1], generator=seeded(0))
     for name in ("precision", "whitening"):
         found = getattr(bank, name)(query)
         agrees = bool(torch.allclose(found, getattr(same, name)(query), rtol=1e-3, atol=1e-3))

@@ -13,7 +13,7 @@ from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, sa
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.terms import Appearance, Correlation, Repeatability
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 from tests._support.scenes import scene
 
 
@@ -126,9 +126,7 @@ def test_matcher_weights_terms(bank):
 def test_distinct_views_applies_symmetries_to_the_model():
     R = rotation_from_axis_angle(double([0.9, -0.4, 0.7]))
     quarter = rotation_from_axis_angle(double([0.0, 0.0, math.pi / 2]))
-    symmetries = torch.stack(
-        [torch.eye(3, dtype=torch.float64), quarter, quarter @ quarter, quarter.T]
-    )
+    symmetries = torch.stack([eye(3), quarter, quarter @ quarter, quarter.T])
     views = torch.stack([R, R @ quarter, quarter @ R, R @ quarter.T])
     assert distinct_views(torch.arange(4), views, count=4, symmetries=symmetries).tolist() == [0, 2]
     assert distinct_views(

@@ -14,6 +14,7 @@ from curvireg_torch.mesh import normalization_transform
 from curvireg_torch.mesh.edges import MeshEdges, encloses_volumes, simplified
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, principal_rotation
 from curvireg_torch.rendering.contours import MeshContours
+from tests._support.numbers import double, eye, seeded
 
 
 @pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (1.0, 0.9, 0.02), (1.0, 0.05, 0.05)])
@@ -23,9 +24,7 @@ def test_extreme_points_of_a_large_hull_keep_the_boxes(scale):
     points = extreme_points(mesh)
     assert len(points) <= 2562
     assert {tuple(p) for p in points.tolist()} <= {tuple(p) for p in mesh.vertices.tolist()}
-    directions = torch.nn.functional.normalize(
-        torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1
-    )
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=seeded(0)), dim=1)
     whole, few = (
         x @ directions.double().T for x in (torch.from_numpy(np.array(mesh.vertices)), points)
     )
@@ -35,7 +34,7 @@ def test_extreme_points_of_a_large_hull_keep_the_boxes(scale):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_normalization_transform_is_invariant_to_similarities(truck, seed):
-    T = torch.eye(4, dtype=torch.float64)
+    T = eye(4)
     T[:3, :3] = 7.0 * torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
     T[:3, 3] = torch.tensor([3.0, -2.0, 5.0])
     meshes = truck, truck.copy().apply_transform(T.numpy())
@@ -49,7 +48,7 @@ def test_normalization_transform_is_invariant_to_similarities(truck, seed):
     assert spread[0] > spread[1] > spread[2]
     assert first.norm(dim=1).max() == pytest.approx(1.0)
     rotation = principal_rotation(truck)
-    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3).double(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(rotation @ rotation.T, eye(3), rtol=0, atol=1e-12)
     assert float(torch.linalg.det(rotation)) == pytest.approx(1.0)
 
 
@@ -84,15 +83,11 @@ def test_welding_joins_vertices_at_one_place_and_drops_faces_twice_or_without_ar
     vertices, faces = simplified(
         trimesh.Trimesh(apart, faces, process=False), np.array([0.5, 0.0, 0.0]), 100
     )
-    assert sorted(vertices.round(3).tolist()) == sorted(
-        (np.asarray(box.vertices) - [0.5, 0, 0]).tolist()
-    )
+    expected = np.asarray(box.vertices) - [0.5, 0, 0]
+    assert sorted(vertices.round(3).tolist()) == sorted(expected.tolist())
     welded = trimesh.Trimesh(vertices, faces, process=False)
-    assert (len(faces), welded.is_watertight, welded.volume) == (
-        12,
-        True,
-        pytest.approx(6.0, rel=1e-5),
-    )
+    assert (len(faces), welded.is_watertight) == (12, True)
+    assert welded.volume == pytest.approx(6.0, rel=1e-5)
 
 
 def test_a_surface_encloses_volumes_where_each_edge_has_two_faces_of_one_orientation():
@@ -140,8 +135,8 @@ def test_parts_smaller_than_what_is_welded_keep_their_edges():
     vertices, faces = simplified(mesh, np.zeros(3), 100)
     assert np.array_equal(vertices[faces], mesh.triangles)
     assert len(MeshEdges(mesh, np.zeros(3), 100).edges) == 6
-    K = torch.tensor([[100.0, 0, 31.5], [0, 100, 31.5], [0, 0, 1]], dtype=torch.float64)
-    T = torch.eye(4, dtype=torch.float64)[None]
+    K = double([[100.0, 0, 31.5], [0, 100, 31.5], [0, 0, 1]])
+    T = eye(4)[None]
     T[0, 2, 3] = 2e7
     points = MeshContours(mesh).points(T, K[None], 64)
     assert points.model.isfinite().all()
@@ -162,7 +157,7 @@ def test_load_mesh_warns_of_the_size(tmp_path, size, warns):
     assert [one.message.kind for one in caught] == ["unit"] * warns
 
 
-def test_places_of_parts_are_multiplied_from_the_root(tmp_path):
+def test_places_of_parts_are_multiplied_from_the_root():
     """A part moved along x below a node that turns x to y: products in the other order put it
     elsewhere."""
     quarter = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1])
@@ -177,8 +172,6 @@ def test_places_of_parts_are_multiplied_from_the_root(tmp_path):
     )
     expected = [[-1.0, 8.5, -0.5], [1.0, 11.5, 0.5]]
     np.testing.assert_allclose(as_mesh(scene).bounds, expected, atol=1e-9)
-    scene.export(tmp_path / "a.glb")
-    np.testing.assert_allclose(cr.load_mesh(tmp_path / "a.glb").bounds, expected, atol=1e-6)
 
 
 def test_a_degenerate_face_takes_no_colours_away(tmp_path):

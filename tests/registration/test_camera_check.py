@@ -10,6 +10,7 @@ from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.camera import focal_contradiction
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from tests._support.numbers import double, seeded
 from tests._support.scenes import learned_registrar
 
 SIZE = (360, 480)
@@ -25,9 +26,9 @@ def near_photograph():
     """(3, H, W) and its box (4,): seen from nearby, so that perspective is strong."""
     mesh = example_mesh()
     R = rotation_from_viewpoint(40.0, 25.0, 0.0).double()
-    ahead = torch.tensor([0.0, 0.0, 2.6 * mesh_radius(mesh)], dtype=torch.float64)
+    ahead = double([0.0, 0.0, 2.6 * mesh_radius(mesh)])
     T = transform(R, ahead - R @ mesh_centre(mesh))
-    return synthesize_photograph(mesh, T, camera(1.0), SIZE, torch.Generator().manual_seed(0))
+    return synthesize_photograph(mesh, T, camera(1.0), SIZE, seeded(0))
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.3])

@@ -16,6 +16,7 @@ from curvireg_torch.geometry.cameras import boxes_around
 from curvireg_torch.registration import FailedRegistration, Follower, detect
 from curvireg_torch.registration.photograph import as_photograph, as_photographs
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
+from tests._support.numbers import eye, seeded
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_registrar
 
@@ -28,7 +29,7 @@ FISHEYE = Camera(OFF_CENTRE, (0.02, -0.01, 0.003, -0.001), "fisheye", SIZE)
 def distorted(camera, seed):
     """A photograph by a camera with distortion, the box and mask of the object in it, and the true
     pose."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     T = random_pose(example_mesh(), OFF_CENTRE, SIZE, generator, elevations=(5.0, 50.0))
     ideal, _ = synthesize_photograph(example_mesh(), T, OFF_CENTRE, SIZE, generator)
     mask = (render_depth(example_mesh(), T, OFF_CENTRE, SIZE)[0, 0] > 0).float()
@@ -188,7 +189,7 @@ def test_camera_is_scaled_to_each_photograph():
         RADIAL,
     )
     point = torch.tensor([[0.4, 0.2, 1.0]]).double()
-    large, small = (project_points(point, torch.eye(4).double(), items[i].K) for i in (0, 1))
+    large, small = (project_points(point, eye(4), items[i].K) for i in (0, 1))
     torch.testing.assert_close((large + 0.5) / 2 - 0.5, small)
     torch.testing.assert_close((items[0].box + 0.5) / 2 - 0.5, items[1].box, atol=0.02, rtol=0)
     (error,) = as_photographs([photo[:, :90]], None, RADIAL)

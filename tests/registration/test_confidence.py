@@ -15,7 +15,7 @@ from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import confidence
 from curvireg_torch.synthetic import procedural_background
-from tests._support.numbers import double
+from tests._support.numbers import double, seeded
 from tests._support.quick import slow_after
 from tests._support.scenes import (
     CAMERA,
@@ -117,12 +117,12 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
 
 def test_confidence_features():
     evidence = Evidence(
-        rank=torch.tensor([0.0, -1.0, -2.0]).double(),
+        rank=double([0.0, -1.0, -2.0]),
         similarity=torch.tensor([0.7, 0.6, 0.5]).double(),
         edge_support=torch.tensor([0.4, 0.5, 0.1]).double(),
         appearance=torch.tensor([1.0, 0.4, 0.8]).double(),
-        keypoints=torch.tensor([2.0, 0.0, 3.0]).double(),
-        details=torch.tensor([0.5, 0.0, 0.0]).double(),
+        keypoints=double([2.0, 0.0, 3.0]),
+        details=double([0.5, 0.0, 0.0]),
         contours=torch.tensor([0.9, 0.8, 1.0]).double(),
     )
     scores = double([5.5, 2.0, 3.0])
@@ -235,7 +235,7 @@ def test_confidence_is_higher_for_the_object_than_for_clutter(count):
     registrar = learned_registrar()
     images, boxes, _ = zip(*(scene(seed) for seed in range(count)), strict=True)
     there = registrar(list(images), torch.stack(boxes), CAMERA)
-    clutter = [procedural_background(SIZE, torch.Generator().manual_seed(s)) for s in range(count)]
+    clutter = [procedural_background(SIZE, seeded(s)) for s in range(count)]
     box = torch.tensor([60.0, 40, 180, 140])
     absent = registrar(clutter, box.expand(count, 4), CAMERA)
     assert min(r.confidence for r in there) > max(r.confidence for r in absent)

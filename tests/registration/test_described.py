@@ -12,6 +12,7 @@ from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration.block import Described, counting_keypoints, evidence_of
 from curvireg_torch.registration.hypotheses import Hypotheses
+from tests._support.numbers import double, eye
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene
 
 
@@ -23,10 +24,10 @@ def frame_of(target, box):
 
 @pytest.mark.parametrize(("chance", "expected"), [(2, [0.0, 0.0, 1.0, 20.0]), (0, [0, 2, 3, 22])])
 def test_keypoints_that_agree_by_chance_do_not_count(chance, expected):
-    counts = torch.tensor([0.0, 2.0, 3.0, 22.0]).double()
+    counts = double([0.0, 2.0, 3.0, 22.0])
     pipeline = Pipeline(fit=FitSettings(chance_keypoints=chance))
     none = torch.zeros(4, dtype=torch.float64)
-    T = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
+    T = eye(4).repeat(4, 1, 1)
     poses = Hypotheses.at(T, T[:, :3, :3], none[:3], none.long(), none)
     described = SimpleNamespace(keypoints=[SimpleNamespace(agreeing=lambda *_: counts), None])
     target = SimpleNamespace(pipeline=pipeline)
@@ -63,7 +64,7 @@ def test_poses_in_frames_and_poses_by_themselves_keep_their_order():
     _, box, T = scene(0)
     none = torch.zeros(4, dtype=torch.float64)
     photograph = torch.tensor([1, 0, 1, 0])
-    turned = torch.stack([T, T, T @ torch.diag(torch.tensor([-1.0, -1, 1, 1]).double()), T])
+    turned = torch.stack([T, T, T @ torch.diag(double([-1.0, -1, 1, 1])), T])
     poses = Hypotheses.at(
         turned, CAMERA.expand(4, 3, 3), target.describer.centre, none.long(), none, photograph
     )

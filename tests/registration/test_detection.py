@@ -26,7 +26,7 @@ from curvireg_torch.registration.detection import DescribedBox, RegisteredBox, _
 from curvireg_torch.registration.photograph import Photograph
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from curvireg_torch.visualization.words import corners
-from tests._support.numbers import double
+from tests._support.numbers import double, seeded
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, scene, unrefined
 
@@ -59,7 +59,7 @@ def pasted_scene(seed, corner, scale):
 
 
 def clutter(seed):
-    return procedural_background(SIZE, torch.Generator().manual_seed(seed))
+    return procedural_background(SIZE, seeded(seed))
 
 
 @pytest.fixture(scope="module")
@@ -395,7 +395,7 @@ def test_box_around_the_pose_is_registered_where_it_is_more_certain(
 
 def test_scores_are_relative_to_the_view_elsewhere_in_the_photograph():
     """Level and spread of a view's similarity do not matter."""
-    generator = torch.Generator().manual_seed(3)
+    generator = seeded(3)
     K = len(detector()._views)
     maps = [0.1 * torch.rand(K, *size, generator=generator) for size in ((15, 20), (21, 28))]
     fits = [torch.ones(K, dtype=torch.bool)] * 2

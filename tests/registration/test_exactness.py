@@ -12,7 +12,7 @@ from curvireg_torch.geometry.cameras import rotation_towards
 from curvireg_torch.registration.camera import principal_covariance
 from curvireg_torch.registration.hypotheses import Hypotheses, placed
 from curvireg_torch.visualization.words import remarks
-from tests._support.numbers import double
+from tests._support.numbers import double, eye, seeded
 from tests._support.results import registration
 from tests._support.scenes import CAMERA
 
@@ -32,7 +32,7 @@ def test_nine_in_ten_errors_are_within(monkeypatch):
     monkeypatch.setitem(CALIBRATION, "radius", {"rotation": 1.0, "distance": 1.0})
     R, t, allocentric, distance = pose()
     exactness = exactness_of(COVARIANCE, R, t, allocentric, distance)
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     normal = torch.randn(4000, 6, generator=generator, dtype=torch.float64)
     errors = normal * COVARIANCE.diagonal().sqrt()
     turns = rotation_from_axis_angle(errors[:, :3])
@@ -50,7 +50,7 @@ def test_nine_in_ten_errors_are_within(monkeypatch):
 
 def test_a_principal_point_that_is_not_known_leaves_the_allocentric_rotation_exact():
     R, t, allocentric, distance = pose()
-    T = torch.eye(4, dtype=torch.float64)[None]
+    T = eye(4)[None]
     T[0, :3, :3] = R
     T[0, :3, 3] = t
     none = torch.zeros(1)
@@ -66,7 +66,7 @@ def test_a_turn_that_nothing_determines_is_left_out():
     R, t, allocentric, distance = pose()
     known = torch.diag(torch.tensor([1e-4, 1e-4, 9.0, 1.0, 1.0, 1.0]).double())
     assert exactness_of(known, R, t, allocentric, distance).rotation_deg < 2.0
-    nothing = torch.diag(torch.tensor([9.0, 9.0, 9.0, 1.0, 1.0, 1.0]).double())
+    nothing = torch.diag(double([9.0, 9.0, 9.0, 1.0, 1.0, 1.0]))
     unknown = exactness_of(nothing, R, t, allocentric, distance)
     assert unknown.rotation_deg == CALIBRATION["radius"]["rotation"] * 180.0
 

@@ -15,7 +15,7 @@ from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.hypotheses import Hypotheses, projected_box
 from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from tests._support.numbers import double
+from tests._support.numbers import double, seeded
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 from tests.fitting.test_focal_length import NEAR, near_scene
 
@@ -66,7 +66,7 @@ def test_focal_lengths_with_small_deviations_are_right():
     small = []
     ratios = []
     for seed in range(6):
-        generator = torch.Generator().manual_seed(seed)
+        generator = seeded(seed)
         widths = (0.7, 1.0, 1.4)[seed % 3]
         K = camera_matrix(640 * widths, 640 * widths, 319.5, 239.5, dtype=torch.float64)
         T = random_pose(mesh, K, size, generator, elevations=(5.0, 50.0))

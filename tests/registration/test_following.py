@@ -16,7 +16,7 @@ from curvireg_torch.geometry.cameras import pose_around
 from curvireg_torch.registration import FailedRegistration, Follower, refine, tracking
 from curvireg_torch.registration.tracking import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
-from tests._support.numbers import double
+from tests._support.numbers import double, seeded
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, sequence, truck_registrar
 
@@ -208,9 +208,7 @@ def test_follower_refines_where_tracking_is_doubtful(monkeypatch):
     jumped = T.clone()
     jumped[:3, :3] = rotation_from_axis_angle(double([0.0, 0.2, 0.0])) @ T[:3, :3]
     jumped[0, 3] += 0.1 * T[2, 3]
-    there = synthesize_photograph(
-        example_mesh(), jumped, CAMERA, SIZE, torch.Generator().manual_seed(9)
-    )[0]
+    there = synthesize_photograph(example_mesh(), jumped, CAMERA, SIZE, seeded(9))[0]
     calls = []
     refine_one = tracking.refine_one
     monkeypatch.setattr(tracking, "TRUSTED_CONFIDENCE", 1.1)  # whatever the tracker says
@@ -257,7 +255,7 @@ def test_follower_loses_an_absent_object_and_finds_it_again():
     frames = sequence(2)
     follow = Follower(learned_registrar(), CAMERA)
     follow(*frames[0][:2])
-    empty = procedural_background(SIZE, torch.Generator().manual_seed(5))
+    empty = procedural_background(SIZE, seeded(5))
     lost = follow(empty)
     assert not lost.ok or lost.confidence < BELIEVED_CONFIDENCE
     result = follow(frames[1][0])

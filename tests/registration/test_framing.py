@@ -18,6 +18,7 @@ from curvireg_torch.geometry.framing import (
 )
 from curvireg_torch.registration.judging import outside_warnings
 from curvireg_torch.registration.photograph import as_photograph
+from tests._support.numbers import double, eye
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene
 
@@ -26,7 +27,7 @@ K = camera_matrix(100.0, 100.0, 49.5, 39.5, dtype=torch.float64)
 
 
 def at(x, y, z):
-    T = torch.eye(4, dtype=torch.float64)
+    T = eye(4)
     T[:3, 3] = torch.tensor([x, y, z])
     return T
 
@@ -110,8 +111,8 @@ def test_frame_knows_what_of_a_crop_lies_in_the_photograph():
     # a square of 80 px without margin that goes on for 20 px to the left and 30 px below
     box = torch.tensor([-20.5, 49.5, 59.5, 129.5])
     frame = CropFrame.of(box, photograph_box((100, 200)), side=16, margin=0.0)
-    corners = torch.tensor([[-20.5, 49.5, 1.0], [59.5, 129.5, 1.0]]).double()
-    expected = torch.tensor([[-0.5, -0.5, 1.0], [15.5, 15.5, 1.0]]).double()
+    corners = double([[-20.5, 49.5, 1.0], [59.5, 129.5, 1.0]])
+    expected = double([[-0.5, -0.5, 1.0], [15.5, 15.5, 1.0]])
     torch.testing.assert_close(corners @ frame.transform.T, expected)
     columns = torch.arange(16) >= 4
     rows = torch.arange(16) < 10
@@ -133,7 +134,7 @@ def test_half_of_an_object_at_the_border_gives_its_pose(seed):
 def test_pixels_of_a_crop_count_from_the_first_to_the_last_one_of_a_box():
     """Pixel k of a crop of 64 px is pixel k + 10 of the photograph."""
     shown = torch.tensor([[20.0, 30.0, 60.0, 71.0], [20.4, 30.4, 59.6, 70.6]])
-    boxes = torch.tensor([9.5, 9.5, 73.5, 73.5]).double().expand(2, 4)
+    boxes = double([9.5, 9.5, 73.5, 73.5]).expand(2, 4)
     expected = torch.zeros(2, 1, 64, 64)
     expected[0, 0, 20:62, 10:51] = 1.0
     expected[1, 0, 21:61, 11:50] = 1.0

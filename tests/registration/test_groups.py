@@ -15,6 +15,7 @@ from curvireg_torch.registration.result import AXIS_TOLERANCE, Axis
 from curvireg_torch.visualization.contours import AXIS
 from curvireg_torch.visualization.overlay import contour_overlay, registration_sheet
 from tests._support.canisters import canister
+from tests._support.numbers import double
 from tests._support.results import registration
 from tests._support.scenes import CAMERA
 from tests.registration.test_ties import hollow_box, photograph, registrar_of
@@ -32,7 +33,7 @@ FEATURES = {
     "border": 0.0,
     "focal": 0.0,
 }
-UPRIGHT = RoundAxis(torch.tensor([0.0, 0.0, 1.0]).double(), torch.zeros(3).double(), False)
+UPRIGHT = RoundAxis(double([0.0, 0.0, 1.0]), torch.zeros(3).double(), False)
 
 
 def turned(*viewpoints):
@@ -123,7 +124,7 @@ def test_the_margin_of_a_pair_is_that_to_the_third():
 
 
 def test_an_axis_is_reliable_only_without_doubts():
-    sure = Axis(torch.tensor([0.0, 0.0, 1.0]).double(), 0.9)
+    sure = Axis(double([0.0, 0.0, 1.0]), 0.9)
     result = replace(registration(confidence=0.4), axis=sure)
     assert result.verdict == "reliable axis"
     assert replace(result, warnings=("of the box",)).verdict != "reliable axis"

@@ -6,24 +6,23 @@ import torch
 
 from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.registration.hypotheses import Hypotheses
+from tests._support.numbers import double, eye
 
 WEIGHTS = EvidenceWeights.only(similarity=10.0)
 
 
 def hypotheses(*similarity):
     count = len(similarity)
-    T = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    T = eye(4).repeat(count, 1, 1)
     T[:, 2, 3] = 5.0
     views = torch.arange(count)
-    cameras = torch.eye(3).double().expand(count, 3, 3)
+    cameras = eye(3).expand(count, 3, 3)
     poses = Hypotheses.at(T, cameras, torch.zeros(3).double(), views, -views.double())
     return replace(poses, evidence=of_similarity(*similarity))
 
 
 def of_similarity(*similarity):
-    return replace(
-        Evidence.zeros(len(similarity)), similarity=torch.tensor(similarity, dtype=torch.float64)
-    )
+    return replace(Evidence.zeros(len(similarity)), similarity=double(similarity))
 
 
 def test_the_best_pose_is_neither_outside_the_limits_nor_merged_with_another():

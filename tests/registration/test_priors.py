@@ -19,7 +19,7 @@ from curvireg_torch.geometry.pose_prior import PosePrior
 from curvireg_torch.registration.block import Limits
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.photograph import Photograph
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, learned_registrar, scene, truck_bank, truck_registrar
 
@@ -77,14 +77,14 @@ def pose_at(away=1.5, degrees=0.0):
     describer = truck_registrar().describer
     index = torch.zeros(1, dtype=torch.long)
     one = torch.ones(1, dtype=torch.float64)
-    pose = torch.eye(4, dtype=torch.float64)[None].clone()
+    pose = eye(4)[None].clone()
     pose[0, :3, :3] = rotation_from_axis_angle(double([0.0, 0.0, math.radians(degrees)]))
     pose[0, :3, 3] = away * double([0.6, 0.0, 0.8]) - pose[0, :3, :3] @ describer.centre
     return Hypotheses.at(pose, CAMERA[None], describer.centre, index, one)
 
 
 def test_fitted_poses_up_to_three_degrees_outside_are_kept_and_within_a_degree_of_a_limit_lie_at_it():  # noqa: E501
-    limits = limits_of(PosePrior(rotation=torch.eye(3, dtype=torch.float64), within=10.0))
+    limits = limits_of(PosePrior(rotation=eye(3), within=10.0))
     assert [bool(limits.keeps(pose_at(degrees=d))) for d in (12.9, 13.1)] == [True, False]
     words = [
         limits.contradiction(pose_at(degrees=d), pose_at(), better_outside=False)

@@ -10,7 +10,7 @@ from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, transform
 from curvireg_torch.registration import refinement
 from curvireg_torch.synthetic import procedural_background, synthesize_photograph
-from tests._support.numbers import double
+from tests._support.numbers import double, seeded
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_bank
 
@@ -60,7 +60,7 @@ def test_refine_reports_the_best_of_several_starts(registrar):
 @pytest.mark.parametrize("seed", slow_after(1, range(3)))
 def test_refine_loses_or_doubts_an_object_that_is_not_there(seed):
     _, _, T = scene(0)
-    empty = procedural_background((192, 256), torch.Generator().manual_seed(seed))
+    empty = procedural_background((192, 256), seeded(seed))
     result = learned_registrar().refine([empty], CAMERA, [T])[0]
     assert not result.ok or result.confidence < 0.3
     assert result.ok or (
@@ -122,7 +122,7 @@ def test_poses_that_look_alike_are_confirmed_by_the_same_registration(number):
     registrar = cr.Registrar(cr.ViewBank.build(mesh, views, image_size=96, progress=False))
     R = cr.rotation_from_viewpoint(30.0, 30.0, 0.0).double()
     T = transform(R, double([0.0, 0.0, 1.2]))
-    image, _ = synthesize_photograph(mesh, T, CAMERA, SIZE, torch.Generator().manual_seed(0))
+    image, _ = synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(0))
     symmetries = registrar.symmetries_of(exact=True).double()
     assert len(symmetries) == 4
     true, turned = registrar.refine([image] * 2, CAMERA, [T, T @ symmetries[number]])

@@ -38,9 +38,11 @@ from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration.photograph import Photograph, check_crop
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from tests._support.numbers import double, seeded
 from tests._support.scenes import (
     CAMERA,
     SIZE,
+    errors,
     learned_registrar,
     scene,
     truck_bank,
@@ -56,20 +58,16 @@ def test_poses_of_synthetic_scenes():
     """Six scenes of known truth, before and after refinement."""
     registrars = truck_registrar(contours=False), truck_registrar()
     registered = [registrar(IMAGES, torch.stack(BOXES), CAMERA) for registrar in registrars]
-    coarse, fine = (
-        torch.stack(
-            [rotation_error(r.rotation, T[:3, :3]) for r, T in zip(results, TRUTHS, strict=True)]
-        )
+    found = [
+        torch.tensor([errors(result, T) for result, T in zip(results, TRUTHS, strict=True)])
         for results in registered
-    )
+    ]
+    coarse, fine = (degrees[:, 0] for degrees in found)
     right = coarse < 20
     assert right.sum() >= 5
     assert fine[right].median() < 4
     assert fine[right].median() <= coarse[right].median()
-    for result, T, is_right in zip(registered[1], TRUTHS, right, strict=True):
-        assert (
-            not is_right or float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.05
-        )
+    assert (found[1][right, 1] < 0.05).all()
 
 
 def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
@@ -104,16 +102,7 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
     images = [IMAGE, grey, nan, IMAGE, tmp_path / "none.png", IMAGE * 255, four, IMAGE]
     boxes = torch.stack([BOX, torch.tensor([5.0, 5, 40, 40]), BOX, -BOX, BOX, BOX, BOX, BOX])
     results = truck_registrar(contours=False)(images, boxes, CAMERA)
-    assert [result.ok for result in results] == [
-        True,
-        False,
-        False,
-        False,
-        False,
-        False,
-        False,
-        True,
-    ]
+    assert [result.ok for result in results] == [True, *[False] * 6, True]
     assert results[0].rotation.equal(results[7].rotation)
     messages = ["one colour", "NaN", "X0 < X1", "none.png: no such file", r"\[0, 1\]", "channels"]
     for i, (result, message) in enumerate(zip(results[1:7], messages, strict=True), start=1):
@@ -229,15 +218,6 @@ def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch,
     assert (result.edge_support == support) == kept
 
 
-def test_default_dtype_does_not_matter():
-    torch.set_default_dtype(torch.float64)
-    try:
-        result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
-    finally:
-        torch.set_default_dtype(torch.float32)
-    assert rotation_error(result.rotation, TRUTH[:3, :3]) < 2
-
-
 def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
     fit_poses = block.fit_poses
 
@@ -270,23 +250,17 @@ def test_registrar_accepts_tensors_arrays_and_paths_and_rejects_bad_calls(tmp_pa
     pixels = (IMAGE * 255).round().byte()
     array = pixels.permute(1, 2, 0).numpy()
     cv2.imwrite(str(tmp_path / "photo.png"), array[..., ::-1])
-    images = [
-        pixels,
-        array,
-        array.astype("float32") / 255,
-        tmp_path / "photo.png",
-        str(tmp_path / "photo.png"),
-    ]
+    file = tmp_path / "photo.png"
+    images = [pixels, array, array.astype("float32") / 255, file, str(file)]
     first, *others = truck_registrar(contours=False)(images, [BOX.tolist()] * 5)
     for result in others:
         torch.testing.assert_close(
             result.ranking.scores, first.ranking.scores, atol=1e-5, rtol=1e-4
         )
     registrar = truck_registrar(contours=False)
+    no_focal = torch.diag(torch.tensor([0.0, 1, 1]))
     with pytest.raises(InvalidInputError, match="focal"):
-        _ = registrar([IMAGE], BOX[None], torch.eye(3).double() * torch.tensor([0.0, 1, 1]))[
-            0
-        ].rotation
+        _ = registrar([IMAGE], BOX[None], no_focal.double())[0].rotation
     for images, boxes, camera, message in (
         ([IMAGE], BOX[None], CAMERA.expand(2, 3, 3), r"expected \(3, 3\) or \(1, 3, 3\)"),
         ([IMAGE], BOX.expand(3, 4), None, r"shape \(1, 4\), one for each image, got \(3, 4\)"),
@@ -315,11 +289,8 @@ def test_covariance_needs_a_reliable_result_and_a_camera(limit):
     registrar = Registrar(bank, pipeline=pipeline)
     result = registrar([IMAGE], BOX[None], CAMERA)[0]
     assert result.reliable == (limit == 0.0)
-    assert (
-        (result.covariance is not None)
-        == (result.standard_deviations is not None)
-        == (limit == 0.0)
-    )
+    for value in (result.covariance, result.standard_deviations):
+        assert (value is not None) == result.reliable
     similar = Registrar(registrar.bank, mesh_is="similar")
     assert similar([IMAGE], BOX[None])[0].covariance is None
     unknown = replace(result, hypotheses=(replace(result.hypotheses[0], covariance=None),))
@@ -379,13 +350,9 @@ def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evide
     """Evidence that depends on the box, as the rank does, is not compared."""
     registrar = truck_registrar()
     one = truck_registrar(box_jitter=0.0)([IMAGE], BOX[None], CAMERA)[0]
+    best = one.hypotheses[0]
     first, other = (
-        replace(
-            one,
-            hypotheses=(
-                replace(one.hypotheses[0], evidence=one.hypotheses[0].evidence | {**known}),
-            ),
-        )
+        replace(one, hypotheses=(replace(best, evidence=best.evidence | known),))
         for known in (
             {"similarity": 0.7, "rank": 0.0},
             {"similarity": 0.7, "rank": -3.0} | evidence,
@@ -409,7 +376,7 @@ def test_hypotheses_that_merge_are_put_back_and_come_last():
     for azimuth in AZIMUTHS:
         R = rotation_from_viewpoint(azimuth, 20.0, 0.0).double()
         T = transform(R, torch.tensor([0.0, 0.0, 3.5 * mesh_radius(mesh)]) - R @ mesh_centre(mesh))
-        image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, torch.Generator().manual_seed(1))
+        image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(1))
         images.append(image)
         boxes.append(box)
     views = sample_views(azimuth_step=30, elevations=[20])
@@ -466,7 +433,7 @@ def test_boxes_are_compared_inside_the_photograph():
         ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),
     ):
         item = Photograph(torch.zeros(3, *size), torch.tensor(given), Camera(CAMERA))
-        assert item.shows_other_part(torch.tensor(box, dtype=torch.float64)) == expected
+        assert item.shows_other_part(double(box)) == expected
 
 
 def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):

@@ -11,7 +11,7 @@ from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration.result import Axis, ambiguity, likely_rivals
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 from tests._support.results import registration
 
 
@@ -33,7 +33,7 @@ def test_to_dict_replaces_unbounded_deviations_by_null():
 def test_a_questionable_answer_is_unsure_and_an_improbable_one_no_match():
     # A high confidence that is not reliable, because of a questionable camera, is no reason to be
     # sure.
-    sure = replace(registration(covariance=0.01 * torch.eye(6).double()), probabilities=(0.95,))
+    sure = replace(registration(covariance=0.01 * eye(6)), probabilities=(0.95,))
     doubtful = replace(sure, warnings=("the camera is questionable",))
     assert (sure.verdict, doubtful.verdict) == ("reliable", "unsure")
     for probabilities, word in (
@@ -127,7 +127,7 @@ def test_of_several_meshes_none_is_right_where_all_of_them_are_improbable():
 
 
 def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_determine():
-    sure = replace(registration(covariance=0.01 * torch.eye(6).double()), probabilities=(0.9, 0.0))
+    sure = replace(registration(covariance=0.01 * eye(6)), probabilities=(0.9, 0.0))
     assert sure.reliable
     changes = [
         {"warnings": ("the camera is questionable",)},
@@ -158,7 +158,7 @@ def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_dete
 
 
 def test_a_rotation_that_is_not_determined_is_not_reliable():
-    sure = registration(covariance=1e-4 * torch.eye(6).double(), confidence=0.95)
+    sure = registration(covariance=1e-4 * eye(6), confidence=0.95)
     fitted = tuple(replace(hypothesis, edge_support=0.6) for hypothesis in sure.hypotheses)
     sure = replace(sure, hypotheses=fitted)
     for undetermined, is_reliable in ((0.99, True), (1.0, False)):

@@ -25,7 +25,7 @@ ORIGIN = torch.eye(4, dtype=torch.float64)
 def turned(*degrees, shift=0.0):
     """(N, 4, 4) world poses about the z axis through the object's centre."""
     angles = torch.deg2rad(double(degrees))
-    R = rotation_from_axis_angle(angles[:, None] * torch.tensor([0.0, 0.0, 1.0]).double())
+    R = rotation_from_axis_angle(angles[:, None] * double([0.0, 0.0, 1.0]))
     moved = torch.tensor([shift, 0.0, 0.0]).double() + CENTRE
     return transform(R, moved - (R @ CENTRE))
 
@@ -88,7 +88,7 @@ def test_candidates_that_are_nearly_equal_count_once():
     rig = rig_of(around(0.0))
     assert rig.distinct(T, score).tolist() == [0, 2, 4, 5]
     assert rig.distinct(T, -score).tolist() == [5, 4, 2, 0]
-    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]).double())
+    half_turn = torch.diag(double([-1.0, -1.0, 1.0]))
     rig.symmetries = torch.stack([torch.eye(3).double(), half_turn])
     assert rig.distinct(T, score).tolist() == [0, 2, 4]
 
@@ -160,9 +160,7 @@ def test_unknown_covariances_have_nearly_no_precision():
 
 
 def test_a_pose_is_seen_where_its_box_overlaps_that_of_the_photograph(monkeypatch):
-    boxes = torch.tensor(
-        [[0.0, 0, 10, 10], [5, 0, 15, 10], [6, 0, 16, 10], [0, 0, 10, 10]]
-    ).double()
+    boxes = double([[0.0, 0, 10, 10], [5, 0, 15, 10], [6, 0, 16, 10], [0, 0, 10, 10]])
     in_front = torch.tensor([True, True, True, False])
     monkeypatch.setattr(rig_module, "boxes_at", lambda *_: (boxes, in_front))
     photograph = SimpleNamespace(K=None, size=(20, 20), box=boxes[0])

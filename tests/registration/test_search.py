@@ -22,6 +22,7 @@ from curvireg_torch.mesh.mesh import principal_rotation
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.registration import block, hypotheses, stages
 from curvireg_torch.terms import Appearance
+from tests._support.numbers import double, eye
 from tests._support.scenes import CAMERA, scene, truck_bank
 
 
@@ -46,9 +47,7 @@ def test_angles_near_run_on_past_the_pole():
     torch.testing.assert_close(before, after, rtol=0, atol=1e-6)
     assert same[20].tolist() == angles[20].tolist()
     past = 2 * 18 + 2  # elevation 100 degrees, above elevation 50 with the same azimuth
-    assert torch.allclose(
-        same[past] - same[20], torch.tensor([0.0, 50.0, 0.0], dtype=torch.float64), atol=1e-4
-    )
+    assert torch.allclose(same[past] - same[20], double([0.0, 50.0, 0.0]), atol=1e-4)
 
 
 def test_divided_contains_both_ends():
@@ -58,14 +57,12 @@ def test_divided_contains_both_ends():
 
 
 def test_motion_is_the_frobenius_norm_of_the_relative_transform_in_radii():
-    R, S = rotation_from_viewpoint(
-        torch.tensor([20.0, 50.0]).double(), 10.0, torch.tensor([0.0, 4.0]).double()
-    )
-    first = torch.eye(4).double()
-    second = torch.eye(4).double()
+    R, S = rotation_from_viewpoint(double([20.0, 50.0]), 10.0, double([0.0, 4.0]))
+    first = eye(4)
+    second = eye(4)
     first[:3, :3], second[:3, :3] = R, S
     first[2, 3], second[2, 3] = 5.0, 5.4
-    E = torch.linalg.matrix_norm(torch.linalg.inv(first) @ second - torch.eye(4).double())
+    E = torch.linalg.matrix_norm(torch.linalg.inv(first) @ second - eye(4))
     assert search.motion((R, first[2, 3]), (S, second[2, 3])) == pytest.approx(float(E), rel=1e-9)
 
 
@@ -120,7 +117,7 @@ def searched(
     pipeline = Pipeline(
         views=ViewPolicy(frame=frame), bank=BankSettings(image_size=32, camera=camera)
     )
-    turn = principal_rotation(mesh) if frame == "principal" else torch.eye(3).double()
+    turn = principal_rotation(mesh) if frame == "principal" else eye(3)
     grid = sample_views(azimuth_step=20, elevations=[0, 50], distances=[3.0, 4.5])
     views = grid.in_frame(turn)
     bank = ViewBank.build(mesh, views, pipeline=pipeline, progress=False)
@@ -269,7 +266,7 @@ def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh
     """A rotated copy of the mesh has the same views, and its pose in the same photograph is rotated
     alike."""
     turn = rotation_from_viewpoint(70.0, 25.0, 40.0).double()
-    T = torch.eye(4).double()
+    T = eye(4)
     T[:3, :3] = turn
     mesh = truck_bank().mesh
     copy = replace(mesh, surface=mesh.surface.copy().apply_transform(T.numpy()))

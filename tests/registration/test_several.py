@@ -13,6 +13,7 @@ from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.registration import rig as rig_module
 from curvireg_torch.registration.rig import Rig
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
+from tests._support.numbers import double, eye, seeded
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE, learned_registrar
 
@@ -22,7 +23,7 @@ EASY = ((100.0, 1), (135.0, 2), (175.0, 3))
 IN_DOUBT = ((335.0, 100), (329.0, 105), (190.0, 107))
 # True T_world_from_model
 TURN = rotation_from_axis_angle(torch.tensor([0.3, -0.8, 0.5]).double())
-HALF_TURN = torch.diag(torch.tensor([-1.0, 1.0, -1.0]).double())
+HALF_TURN = torch.diag(double([-1.0, 1.0, -1.0]))
 WORLD = transform(TURN, torch.tensor([0.2, 0.1, -0.4]).double())
 
 
@@ -30,10 +31,10 @@ WORLD = transform(TURN, torch.tensor([0.2, 0.1, -0.4]).double())
 def photograph(azimuth, seed, noise):
     """(3, H, W), its box (4,) and the true ``T_cam_from_model``, from six radii away and slightly
     above."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     mesh = example_mesh()
     R = rotation_from_viewpoint(azimuth, 8.0, 0.0).double()
-    ahead = torch.tensor([0.0, 0.0, 6.0 * mesh_radius(mesh)], dtype=torch.float64)
+    ahead = double([0.0, 0.0, 6.0 * mesh_radius(mesh)])
     T = transform(R, ahead - R @ mesh_centre(mesh))
     image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, generator, texture=0.6)
     return (image + noise * torch.randn(image.shape, generator=generator)).clamp(0, 1), box, T
@@ -120,7 +121,7 @@ def test_the_joint_fit_begins_at_each_pose_and_where_a_coarse_fit_moves_it(monke
 def test_photographs_that_fail_are_reported_and_change_nothing(easy, tmp_path):
     images, boxes, cameras = rig_of(EASY)
     other, box, T = photograph(60.0, 4, 0.1)
-    empty = procedural_background(SIZE, torch.Generator().manual_seed(5))
+    empty = procedural_background(SIZE, seeded(5))
     more = torch.stack(
         [T @ torch.linalg.inv(WORLD), photograph(220.0, 4, 0.1)[2] @ torch.linalg.inv(WORLD)]
     )
@@ -192,8 +193,8 @@ def test_covariance_shrinks_with_photographs_but_not_with_copies(easy):
 def test_covariance_grows_where_photographs_contradict_each_other(easy):
     """A camera that is turned by a degree moves its picture by 5 px of 100."""
     images, boxes, cameras = rig_of(EASY)
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[:3, :3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0175, 0.0], dtype=torch.float64))
+    turn = eye(4)
+    turn[:3, :3] = rotation_from_axis_angle(double([0.0, 0.0175, 0.0]))
     result = registered(images, boxes, torch.stack([cameras[0], turn @ cameras[1], cameras[2]]))
     spread = [float(r.hypotheses[0].covariance[3:, 3:].trace()) for r in (easy, result)]
     assert spread[1] > 2 * spread[0]
@@ -201,8 +202,8 @@ def test_covariance_grows_where_photographs_contradict_each_other(easy):
 
 def test_a_motion_of_the_world_moves_the_answer(easy):
     images, boxes, cameras = rig_of(EASY)
-    turn = rotation_from_axis_angle(torch.tensor([0.4, 2.0, -0.7], dtype=torch.float64))
-    motion = transform(turn, torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64))
+    turn = rotation_from_axis_angle(double([0.4, 2.0, -0.7]))
+    motion = transform(turn, double([3.0, -1.0, 0.5]))
     moved = registered(images, boxes, cameras @ torch.linalg.inv(motion))
     torch.testing.assert_close(moved.transform, motion @ easy.transform, atol=1e-5, rtol=0)
     assert moved.confidence == pytest.approx(easy.confidence, abs=1e-3)

@@ -14,9 +14,10 @@ from curvireg_torch.registration import several
 from curvireg_torch.registration.confidence import hypothesis_probabilities
 from curvireg_torch.registration.photograph import as_photograph, copies_of
 from curvireg_torch.registration.rig import JointPoses
+from tests._support.numbers import double, eye
 
 ANY_RIGHT = 0.8
-EYE = torch.eye(4, dtype=torch.float64)
+EYE = eye(4)
 
 
 def photograph(index, **changes):
@@ -42,7 +43,7 @@ def photograph(index, **changes):
         camera=EYE,
         printed=lambda _: 0.0,
         photograph=SimpleNamespace(
-            K=torch.eye(3).double(), size=(100, 200), box=torch.tensor([10.0, 10.0, 50.0, 50.0])
+            K=eye(3), size=(100, 200), box=torch.tensor([10.0, 10.0, 50.0, 50.0])
         ),
     )
 
@@ -56,7 +57,7 @@ class FakeRig:
     vote: dict[int, float]
     exact = True
     describer = SimpleNamespace(hull=None)
-    symmetries = torch.eye(3).double()[None]
+    symmetries = eye(3)[None]
 
     def __init__(self, _, photographs):
         self.photographs = photographs
@@ -113,7 +114,7 @@ def two(**changes):
 
 
 SCORES = {0: [9.0, 7.0, 4.0], 1: [8.0, 7.0, 6.0]}
-TOTAL = torch.tensor([17.0, 14.0, 10.0]).double()
+TOTAL = double([17.0, 14.0, 10.0])
 TOGETHER = hypothesis_probabilities(ANY_RIGHT, TOTAL, exact=True)
 
 
@@ -130,7 +131,7 @@ def test_probabilities_are_those_of_the_sums_of_scores(monkeypatch):
 
 def test_votes_weight_scores_and_contributions(monkeypatch):
     result = joint(monkeypatch, two(), SCORES, vote={0: 0.5, 1: 0.25})
-    total = torch.tensor([6.5, 5.25, 3.5]).double()
+    total = double([6.5, 5.25, 3.5])
     expected = hypothesis_probabilities(ANY_RIGHT, total, exact=True)
     assert result.probabilities == pytest.approx(expected)
     assert [view.contribution for view in result.views] == [1.0, 0.25]
@@ -206,7 +207,7 @@ def test_copies_are_of_one_camera_in_one_place(away):
     image = torch.rand(1, 40, 60)
     wide = Camera([[50.0, 0, 29.5], [0, 50, 19.5], [0, 0, 1]], size=(40, 60))
     one = as_photograph(image, None, wide)
-    T = torch.eye(4).double().repeat(2, 1, 1)
+    T = eye(4).repeat(2, 1, 1)
     T[:, 2, 3] = away
     assert copies_of(T, [one, one]) == {1: 0}
     assert copies_of(T, [InvalidInputError("dark"), one]) == {}

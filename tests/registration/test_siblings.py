@@ -19,7 +19,7 @@ from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import Siblings
 from curvireg_torch.registration.target import TellingSymmetries
 from tests._support.hypotheses import evidence_of
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 from tests._support.scenes import CAMERA
 
 
@@ -27,7 +27,7 @@ def four(similarity, compare, angles):
     """Siblings turned about z by ``angles``, the first of which has the highest score; all look
     different from the others."""
     R = torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in angles])
-    T = transform(R, torch.tensor([0.0, 0.0, 5.0]).double().expand(len(R), 3))
+    T = transform(R, double([0.0, 0.0, 5.0]).expand(len(R), 3))
     index = torch.zeros(len(T), dtype=torch.long)
     rank = torch.zeros(len(T), dtype=torch.float64)
     poses = Hypotheses.at(T, CAMERA.expand(len(T), 3, 3), torch.zeros(3).double(), index, rank)
@@ -81,7 +81,7 @@ def test_siblings_that_look_alike_are_rivals_if_the_hidden_feature_is_notable():
 
 def turns_about_z(count):
     angles = torch.arange(count).double() * (2.0 * math.pi / count)
-    R = rotation_from_axis_angle(angles[:, None] * torch.tensor([0.0, 0.0, 1.0]).double())
+    R = rotation_from_axis_angle(angles[:, None] * double([0.0, 0.0, 1.0]))
     return transform(R, torch.zeros(count, 3).double())
 
 
@@ -166,7 +166,7 @@ def test_siblings_outside_the_limits_count_as_neither(monkeypatch):
 
 def test_meshes_without_a_telling_feature_have_no_siblings(monkeypatch):
     case = Case(monkeypatch, [0.80, 0.75, 0.70])
-    case.symmetries = torch.eye(4).double()[None]
+    case.symmetries = eye(4)[None]
     poses, _, rival = case.run()
     assert torch.equal(poses.T, case.poses.T)
     assert len(rival) == 0

@@ -5,14 +5,14 @@ import torch
 
 from curvireg_torch.registration.photograph import MIN_BOX_SIDE
 from curvireg_torch.registration.refinement import INVERSE, OPENGL, why_outside
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 
 SIZE = (180, 240)
 K = double([[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]])
 
 
 def pose(*translation):
-    T = torch.eye(4, dtype=torch.float64)
+    T = eye(4)
     T[:3, 3] = double(translation)
     return T
 
@@ -73,7 +73,7 @@ def test_the_pose_of_the_camera_in_the_object_is_named(is_opengl):
 )
 def test_a_mistake_is_named_if_without_it_the_mesh_fills_a_sensible_part(side, centre, named):
     """A plate, whose box has this side and centre in px once its translation is divided by 1000."""
-    plate = 0.05 * torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]).double()
+    plate = 0.05 * double([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     z = 260.0 * 0.1 / side
     right = pose(*((torch.tensor(centre) - K[:2, 2]) * z / 260.0).tolist(), z)
     wrong = right.clone()

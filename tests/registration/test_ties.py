@@ -14,6 +14,7 @@ from curvireg_torch.mesh import mesh_centre, mesh_radius, mesh_symmetries
 from curvireg_torch.mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from curvireg_torch.registration.target import MAX_SIBLINGS, spread, telling_symmetries
 from curvireg_torch.synthetic import synthesize_photograph
+from tests._support.numbers import double, eye, seeded
 from tests._support.quick import slow_after
 from tests._support.scenes import CAMERA, SIZE
 
@@ -51,9 +52,9 @@ def registrar_of(mesh, **options):
 
 def photograph(mesh, azimuth, elevation, seed):
     """(3, H, W), its box (4,) and the true ``T_cam_from_model``."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     R = rotation_from_viewpoint(azimuth, elevation, 0.0).double()
-    ahead = torch.tensor([0.0, 0.0, 5.0 * mesh_radius(mesh)], dtype=torch.float64)
+    ahead = double([0.0, 0.0, 5.0 * mesh_radius(mesh)])
     T = transform(R, ahead - R @ mesh_centre(mesh))
     return (*synthesize_photograph(mesh, T, CAMERA, SIZE, generator), T)
 
@@ -150,7 +151,7 @@ def test_telling_symmetries_are_those_that_a_feature_breaks():
     assert fractions[0] == 0.0
     assert (fractions[1:] > FEATURE_FRACTION).all()
     telling = telling_symmetries(marked_box(), group)
-    assert torch.equal(telling.transforms[0], torch.eye(4).double())
+    assert torch.equal(telling.transforms[0], eye(4))
     assert len(telling) == 4
 
 

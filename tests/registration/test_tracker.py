@@ -33,7 +33,7 @@ from curvireg_torch.registration.tracking import FLOW_SCALES, Tracker
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
-from tests._support.numbers import double
+from tests._support.numbers import double, eye, seeded
 from tests._support.scenes import CAMERA, sequence
 from tests.fitting.cube import cube, pose
 
@@ -73,10 +73,10 @@ def shift_in_pixels(T, truth):
 def plate(x=0.0, y=0.0):
     """A plate with a print, 160 px wide, moved in its plane by (x, y): its window, pose, and
     depth."""
-    T = transform(torch.eye(3, dtype=torch.float64), double([x, y, 5.0]))[None]
+    T = transform(eye(3), double([x, y, 5.0]))[None]
     size = (CROP_SIZE, CROP_SIZE)
     depth = make_renderer(trimesh.creation.box((2.0, 2.0, 0.01))).render(T, WINDOW_K, size)
-    rough = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
+    rough = torch.rand(1, 1, 64, 64, generator=seeded(0))
     smooth = torch.nn.functional.interpolate(rough, size=1024, mode="bicubic")[0, 0]
     v, u = torch.meshgrid(torch.arange(256.0), torch.arange(256.0), indexing="ij")
     shift = 80.0 * torch.tensor([x, y])
@@ -157,7 +157,7 @@ def test_a_step_follows_edges_the_end_of_the_colours_and_corners(monkeypatch):
         return torch.zeros(1, 6).double()
 
     monkeypatch.setattr(ContourProblem, "selected_step", selected_step)
-    model = torch.rand(1, 9, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
+    model = torch.rand(1, 9, 3, generator=seeded(0)).double() - 0.5
     uv = pixels(model, START[None], found.frame.K, follow.centre)
     corners = PointMatches(model, uv, torch.ones(1, 9).double())
     T = follow._step(found.frame, state, corners, 4.0)
@@ -204,7 +204,7 @@ def test_tracker_follows_a_generated_sequence_until_the_object_is_absent():
         C = follow.covariance(found)
         assert torch.linalg.eigvalsh(C).min() > 0
         assert torch.rad2deg(C[:3, :3].diagonal().sqrt()).max() < 20.0
-    noise = torch.rand(frames[0][0].shape, generator=torch.Generator().manual_seed(1))
+    noise = torch.rand(frames[0][0].shape, generator=seeded(1))
     assert follow.track(noise, CAMERA).confidence < 0.2
 
 
@@ -318,7 +318,7 @@ def test_what_lies_outside_the_window_is_not_learned():
 
 def test_histograms_are_smoothed_along_each_channel():
     """What lies beyond the first and the last level counts as these."""
-    counts = torch.rand(2, 3, 8, 8, 8, generator=torch.Generator().manual_seed(0))
+    counts = torch.rand(2, 3, 8, 8, 8, generator=seeded(0))
     expected = counts
     for axis in (2, 3, 4):
         levels = expected.unbind(axis)

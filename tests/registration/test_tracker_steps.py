@@ -14,7 +14,7 @@ from curvireg_torch.fitting.regions import RegionModel, Silhouette
 from curvireg_torch.geometry.framing import boxes_at
 from curvireg_torch.registration import tracking
 from curvireg_torch.registration.tracking import Tracker
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 from tests.fitting.cube import pose
 
 K = double([[200.0, 0, 99.5], [0, 200.0, 49.5], [0, 0, 1]])
@@ -111,7 +111,7 @@ def fitted(
         return state.T * torch.tensor([1.01, 1.01, 1.01, 1.0])
 
     def tracked(frame, state, flows):
-        assert torch.allclose(state.T[:, :3, :3], torch.eye(3).double())
+        assert torch.allclose(state.T[:, :3, :3], eye(3))
         assert state.points == ("again" if stale else None)
         return float(frame.K[0, 0, 0]), len(flows)
 
@@ -305,7 +305,7 @@ def test_lines_along_which_colours_say_nothing_do_not_count():
     """A variance as flat as a search of 4 px has: 16 / 3, of which half a px² is the tracker's."""
     radius = 4
     flat = radius**2 / 3.0 - tracking.REGION_VARIANCE
-    mean = torch.tensor([1.0, 2.0, -1.0]).double()
+    mean = double([1.0, 2.0, -1.0])
     variance = torch.tensor([0.0, flat, 2.0 * flat]).double()
     J = torch.ones(1, 3, 6).double()
     follow = SimpleNamespace(

@@ -17,6 +17,7 @@ from curvireg_torch.geometry.framing import (
 from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.registration.rig import RigPhotograph
 from curvireg_torch.registration.stages import _other_box, describe, rank
+from tests._support.numbers import double, eye
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene
 
 
@@ -37,16 +38,16 @@ def half_hidden(seed, *, by=0.45):
 
 
 def test_hidden_boxes_go_on_beyond_one_side_each():
-    box = torch.tensor([10.0, 20.0, 50.0, 40.0]).double()
+    box = double([10.0, 20.0, 50.0, 40.0])
     found = torch.stack(hidden_boxes(box)) - box
     assert len(found) == 4 * len(HIDDEN_EXTENSIONS)
     for few, extension in zip(found.split(4), HIDDEN_EXTENSIONS, strict=True):
-        expected = extension * torch.tensor([-40.0, -20.0, 40.0, 20.0]).double().diag()
+        expected = extension * double([-40.0, -20.0, 40.0, 20.0]).diag()
         torch.testing.assert_close(few, expected)
 
 
 def test_what_is_shown_is_the_box_with_a_margin_inside_the_photograph():
-    box = torch.tensor([10.0, 1.0, 50.0, 21.0]).double()
+    box = double([10.0, 1.0, 50.0, 21.0])
     margin = VISIBLE_MARGIN * 40.0
     expected = [10.0 - margin, -0.5, 50.0 + margin, 21.0 + margin]
     assert around_visible(box, (100, 200)).tolist() == pytest.approx(expected)
@@ -63,7 +64,7 @@ def test_what_lies_beside_a_visible_box_does_not_count():
         points = torch.stack([middle, beside]).double()
         to_crop = block.crops.transforms[0]
         result = SimpleNamespace(corrected_box=None, ranking=None)
-        of_rig = RigPhotograph.of(registrar, item, result, 0, torch.eye(4).double())
+        of_rig = RigPhotograph.of(registrar, item, result, 0, eye(4))
         uv = (points @ to_crop[:2, :2].T + to_crop[:2, 2])[None]
         valid = torch.ones(1, 2, dtype=torch.bool)
         for crops in (block.crops, of_rig.crops):

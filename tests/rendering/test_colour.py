@@ -6,8 +6,7 @@ import trimesh
 from PIL import Image
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
-from curvireg_torch.mesh import as_mesh, load_mesh
-from curvireg_torch.mesh.colours import colours_at
+from curvireg_torch.mesh import as_mesh
 from curvireg_torch.rendering import make_renderer, render_colour, shade
 from tests._support.numbers import double
 
@@ -111,16 +110,8 @@ def test_render_colour_is_grey_without_colours_or_faces():
     assert (single == shade(make_renderer(bare).render(T, K, SIZE), K)).all()
 
 
-def test_cleaning_preserves_vertex_and_face_colours():
+def test_colours_of_vertices_are_interpolated():
     box = trimesh.creation.box()
-    # cleaning removes the degenerate face, which shifts the others
-    faces = np.concatenate([[[0, 0, 1]], box.faces])
-    by_face = np.concatenate([[[9, 9, 9, 255]], np.tile([[0, 0, 250, 255]], (12, 1))]).astype(
-        np.uint8
-    )
-    mesh = trimesh.Trimesh(box.vertices, faces, face_colors=by_face, process=False)
-    middle = render_colour(mesh, camera(0.0, 0.0), K, SIZE)[0, :, 36, 48]
-    assert middle.tolist() == pytest.approx([0.0, 0.0, 0.9 * 250 / 255], abs=0.02)
     by_vertex = np.c_[
         np.where(box.vertices[:, 2:] > 0, [[255, 0, 0]], [[0, 255, 0]]), np.full(8, 255)
     ]
@@ -131,50 +122,3 @@ def test_cleaning_preserves_vertex_and_face_colours():
     assert picture[0, 24, 48] > 2 * picture[1, 24, 48]  # red above
     assert picture[1, 47, 48] > 2 * picture[0, 47, 48]  # green below
     assert picture[:2, 36, 48].tolist() == pytest.approx([0.45, 0.45], abs=0.05)
-
-
-@pytest.mark.parametrize("suffix", [".glb", ".obj"])
-def test_load_mesh_reads_textures_and_materials(tmp_path, suffix):
-    red = trimesh.creation.box((0.4, 0.4, 0.4))
-    material = trimesh.visual.material
-    # Factors of glTF are linear: 0.2 of it is 124 of sRGB.
-    rgba = np.array([255, 51, 0, 255] if suffix == ".glb" else [255, 124, 0, 255], np.uint8)
-    plain = (
-        material.PBRMaterial(baseColorFactor=rgba)
-        if suffix == ".glb"
-        else material.SimpleMaterial(diffuse=rgba)
-    )
-    red.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(red.vertices), 2)), material=plain)
-    scene = trimesh.Scene()
-    scene.add_geometry(textured_box(), geom_name="printed")
-    shift = trimesh.transformations.translation_matrix([1.5, 0, 0])
-    scene.add_geometry(red, geom_name="red", transform=shift)
-    path = tmp_path / f"two{suffix}"
-    scene.export(path)
-    mesh = load_mesh(path, up="z")
-    colours = mesh.colours
-    assert len(colours) == len(mesh.faces) == 24
-    assert len(colours.textures) == 1
-    centres = mesh.surface.triangles_center
-    is_red = centres[:, 0] > 1.0
-    assert is_red.sum() == 12
-    centre = np.full(24, 1 / 3, np.float32)
-    found = colours_at(colours, np.arange(24, dtype=np.int32), centre, centre)
-    np.testing.assert_allclose(found[is_red], np.tile([1.0, 124 / 255, 0.0], (12, 1)), atol=0.005)
-    box = textured_box()
-    expected = as_mesh(box).colours
-    assert expected is not None
-    by_centre = {tuple(np.round(c, 4)): i for i, c in enumerate(box.triangles_center)}
-    match = np.array([by_centre[tuple(np.round(c, 4))] for c in centres[~is_red]], np.int32)
-    np.testing.assert_allclose(
-        found[~is_red], colours_at(expected, match, centre[:12], centre[:12]), atol=0.02
-    )
-
-
-def test_load_mesh_warns_of_a_damaged_texture(tmp_path):
-    textured_box().export(tmp_path / "box.obj")
-    picture = next(p for p in tmp_path.iterdir() if p.suffix in (".png", ".jpg", ".jpeg"))
-    picture.write_bytes(picture.read_bytes()[: picture.stat().st_size // 2])
-    with pytest.warns(UserWarning, match="texture"):
-        mesh = load_mesh(tmp_path / "box.obj")
-    assert len(mesh.faces) == 12

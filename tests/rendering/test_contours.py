@@ -14,8 +14,9 @@ from curvireg_torch.rendering.contours import (
     MeshContours,
     _spread_evenly,
 )
+from tests._support.numbers import double, eye
 
-K = torch.tensor([[220.0, 0, 63.5], [0, 220.0, 63.5], [0, 0, 1]], dtype=torch.float64)
+K = double([[220.0, 0, 63.5], [0, 220.0, 63.5], [0, 0, 1]])
 
 
 def stairs(unit):
@@ -74,7 +75,7 @@ def test_edges_that_reach_behind_the_camera_have_no_points(unit):
     plate.apply_translation((0.0, 0.0, 6.0))
     mesh = trimesh.util.concatenate([bar, plate])
     mesh.apply_scale(unit)
-    T = transform(torch.eye(3).double(), unit * torch.tensor([0.5, 0.0, 0.0]).double())[None]
+    T = transform(eye(3), unit * double([0.5, 0.0, 0.0]))[None]
     points = MeshContours(mesh).points(T, K[None], 128)
     model = points.model[points.valid] / unit
     assert len(model) > 20
@@ -87,7 +88,7 @@ def test_normals_of_outlines_point_away_from_the_object(inside_out):
     ball = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
     if inside_out:
         ball.invert()
-    T = transform(torch.eye(3).double(), torch.tensor([0.0, 0.0, 300.0]).double())[None]
+    T = transform(eye(3), double([0.0, 0.0, 300.0]))[None]
     points = MeshContours(ball).points(T, K[None], 128)
     model = points.model[points.outline]
     radial = model[:, :2] / model[:, :2].norm(dim=1, keepdim=True)

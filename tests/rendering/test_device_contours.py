@@ -8,6 +8,7 @@ from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.rendering.visibility import FaceTests
 from curvireg_torch.rendering.zbuffer import DeviceRenderer, _groups
 from curvireg_torch.synthetic import example_mesh, random_pose
+from tests._support.numbers import double, seeded
 
 MESHES = {
     "truck": example_mesh,
@@ -30,7 +31,7 @@ def by_face_tests(mesh, monkeypatch):
 
 
 def poses_of(mesh, size, count):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     K = camera_matrix(2.5 * size, 2.4 * size, 0.5 * size, 0.45 * size, dtype=torch.float64)
     T = [random_pose(mesh, K, (size, size), generator) for _ in range(count)]
     return torch.stack(T), K
@@ -82,7 +83,7 @@ def test_depth_of_the_device_is_that_of_rays(name, orthographic):
     mesh = MESHES[name]()
     T, K = poses_of(mesh, 96, 3)
     if orthographic:
-        K = torch.diag(torch.tensor([0.2, 0.2, 1.0], dtype=torch.float64)) @ K
+        K = torch.diag(double([0.2, 0.2, 1.0])) @ K
         K[:2, 2] *= 5.0
     given = T, K, (90, 100)
     expected = make_renderer(mesh, "embree").render(*given, orthographic=orthographic)

@@ -13,7 +13,7 @@ import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
 from curvireg_torch.rendering import contours as contours_module
 from curvireg_torch.rendering import make_renderer
-from tests._support.numbers import double
+from tests._support.numbers import double, eye
 
 from .conftest import camera
 
@@ -125,7 +125,7 @@ def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(
     monkeypatch.setattr(contours_module.MeshContours, "_level", watched)
     # 20 480 faces
     contours = contours_module.MeshContours(trimesh.creation.icosphere(subdivisions=5))
-    T = torch.eye(4, dtype=torch.float64)[None]
+    T = eye(4)[None]
     T[0, 2, 3] = 4.0
     for size in (100, 128, 129, 256, 400):
         K = double([[[size, 0, (size - 1) / 2], [0, size, (size - 1) / 2], [0, 0, 1]]])

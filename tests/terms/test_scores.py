@@ -13,6 +13,7 @@ from curvireg_torch import ViewMatcher, terms
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import ImageGradient
+from tests._support.numbers import seeded
 from tests._support.scenes import scene
 
 
@@ -32,7 +33,7 @@ def test_correlation_is_the_cosine_of_the_better_crop_scored_by_standard_deviati
 
 
 def sample(count, length=12):
-    generator = torch.Generator().manual_seed(count)
+    generator = seeded(count)
     mixing = torch.randn(length, length, generator=generator)
     return torch.randn(count, length, generator=generator) @ mixing + 3.0
 
@@ -96,7 +97,7 @@ def test_matcher_ranks_by_the_product_that_the_paper_prints(bank):
 
 @pytest.mark.parametrize("eps", [0.0, 1.0, 2.0, 2.5, 2.9, 3.0, 4.0])
 def test_dilate_points_uses_a_euclidean_disc(eps):
-    points = torch.rand(3, 31, 40, generator=torch.Generator().manual_seed(0)) < 0.02
+    points = torch.rand(3, 31, 40, generator=seeded(0)) < 0.02
     points[0] = False
     dilated = terms.dilate_points(points, eps)
     assert not dilated[0].any()
@@ -233,7 +234,7 @@ def test_a_field_that_changes_the_learned_one_is_used():
         def forward(self, image):
             return 2.0 * super().forward(image)
 
-    crops = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    crops = torch.rand(2, 3, 64, 64, generator=seeded(0))
     (once, mask), (twice, same) = (
         terms.photograph_field(f(), crops) for f in (LearnedCurvilinearSaliency, Doubled)
     )

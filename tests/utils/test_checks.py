@@ -9,10 +9,9 @@ import curvireg_torch as cr
 from curvireg_torch import errors, geometry
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.utils import checks
+from tests._support.numbers import double, eye, seeded
 
-CAMERA = torch.tensor(
-    [[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]], dtype=torch.float64
-)
+CAMERA = double([[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]])
 POSE = geometry.transform(
     cr.rotation_from_viewpoint(30.0, 20.0).double(), torch.tensor([0.1, 0.2, 6.0]).double()
 )
@@ -52,9 +51,9 @@ R = POSE[:3, :3]
 BAD_ROTATIONS = {
     "scaled by 1 %": 1.01 * R,
     "one axis scaled": torch.diag(torch.tensor([1.0, 1.0, 1.02]).double()) @ R,
-    "mirrored": torch.diag(torch.tensor([-1.0, 1.0, 1.0]).double()) @ R,
+    "mirrored": torch.diag(double([-1.0, 1.0, 1.0])) @ R,
     "inverted": -R,
-    "sheared": changed(torch.eye(3).double(), (0, 1, 0.02)) @ R,
+    "sheared": changed(eye(3), (0, 1, 0.02)) @ R,
     "zero": 0.0 * R,
 }
 
@@ -83,7 +82,7 @@ def test_check_pose_refuses_other_rows_and_missing_values():
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
 def test_check_pose_accepts_rounded_poses(dtype):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     R = geometry.rotation_from_axis_angle(
         2.0 * torch.randn(500, 3, generator=generator, dtype=torch.float64)
     )

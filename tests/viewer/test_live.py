@@ -23,7 +23,7 @@ from curvireg_torch.registration import FailedRegistration, Follower
 from curvireg_torch.viewer.live import LivePage
 from curvireg_torch.visualization.contours import OUTLINE
 from tests._support.lists import CAMERA
-from tests._support.scenes import learned_registrar, sequence
+from tests._support.scenes import bytes_bgr, learned_registrar, sequence
 
 
 def camera(frames, taken):
@@ -60,9 +60,7 @@ def test_a_frame_is_drawn_once_the_one_before_is_with_a_browser():
 def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):
     scenes = sequence(4)
     learned_registrar().bank.save(tmp_path / "truck.safetensors")
-    pictures = [
-        (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy() for image, _, _ in scenes
-    ]
+    pictures = [bytes_bgr(image) for image, _, _ in scenes]
     seen = []
     pages = []
     threads = []
@@ -96,16 +94,8 @@ def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Follower, "__call__", interrupted)
     monkeypatch.setattr(cv2, "VideoCapture", lambda _: camera(pictures, seen))
     box = map(str, scenes[0][1].tolist())
-    words = [
-        "follow",
-        "0",
-        str(tmp_path / "truck.safetensors"),
-        "--camera",
-        *map(str, CAMERA),
-        "--box",
-        *box,
-    ]
-    assert main([*words, "--show", "--json"]) == 0
+    words = ["follow", "0", str(tmp_path / "truck.safetensors"), "--camera", *map(str, CAMERA)]
+    assert main([*words, "--box", *box, "--show", "--json"]) == 0
     threads[0].join(10)
     printed = capsys.readouterr()
     assert [json.loads(line)["frame"] for line in printed.out.splitlines()] == [

@@ -82,14 +82,8 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
     assert (first.box, second.box, third.box) == (tuple(rows[0][1:5]), None, tuple(rows[2][1:5]))
     assert session.command() == "curvireg register --views rig.csv truck.safetensors --out result"
     search(workspace)
-    words = [
-        "register",
-        "--views",
-        str(folder / "rig.csv"),
-        str(folder / "truck.safetensors"),
-        "--quiet",
-    ]
-    assert main([*words, "--out", str(tmp_path / "result")]) == 0
+    files = ["--views", str(folder / "rig.csv"), str(folder / "truck.safetensors")]
+    assert main(["register", *files, "--quiet", "--out", str(tmp_path / "result")]) == 0
     written = json.loads((tmp_path / "result" / "result.json").read_text())
     document = json.loads(to_json(session.document()))
     assert rotation_error(torch.tensor(document["rotation"]).double(), WORLD[:3, :3]) < 1.5

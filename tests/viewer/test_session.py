@@ -78,15 +78,8 @@ def test_command_gives_the_same_result_bit_by_bit(session, registered):
     )
     written = run_command(folder, session.command())
     document = json.loads(to_json(session.document()))
-    for key in (
-        "rotation",
-        "translation",
-        "score",
-        "confidence",
-        "covariance",
-        "hypotheses",
-        "pipeline",
-    ):
+    keys = ("rotation", "translation", "score", "confidence", "covariance", "hypotheses")
+    for key in (*keys, "pipeline"):
         assert document[key] == written[key], key
     assert document["inputs"]["box"] == written["inputs"]["box"]
     assert document["viewer"] == {"command": session.command(), "hypothesis": 0, "by_hand": []}
@@ -107,93 +100,81 @@ def test_without_a_box_the_answer_is_a_detection(session, registered):
 
 
 def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registered):
-    found = session.shot.result.registration
+    shot = session.shot
+    found = shot.result.registration
     first = session.document()
-    session.shot.choose(1)
+    shot.choose(1)
     document = json.loads(to_json(session.document()))
-    assert document["rotation"] == first["hypotheses"][1]["rotation"]
-    assert document["translation"] == first["hypotheses"][1]["translation"]
-    assert document["score"] == first["hypotheses"][1]["score"]
-    assert [one["rotation"] for one in document["hypotheses"]] == [
-        first["hypotheses"][k]["rotation"] for k in (1, 0)
-    ]
+    best, second = first["hypotheses"]
+    for name in ("rotation", "translation", "score"):
+        assert document[name] == second[name]
+    rotations = [one["rotation"] for one in document["hypotheses"]]
+    assert rotations == [second["rotation"], best["rotation"]]
     assert document["viewer"]["hypothesis"] == 1
     # A pipeline that was calibrated has probabilities; each answer has its own.
     calibrated = replace(found, probabilities=(0.95, 0.03))
-    session.shot.result = replace(session.shot.result, registration=calibrated)
-    assert (session.document()["confidence"], session.document()["reliable"]) == (0.03, False)
-    assert (session.document()["probabilities"], session.document()["no_match_probability"]) == (
-        [0.03, 0.95],
-        pytest.approx(0.02),
-    )
-    assert session.document()["covariance"] is None
-    session.shot.choose(0)
-    assert session.shot.result.chosen is calibrated
-    session.shot.result = replace(session.shot.result, registration=found)
+    shot.result = replace(shot.result, registration=calibrated)
+    document = session.document()
+    assert (document["confidence"], document["reliable"]) == (0.03, False)
+    assert document["probabilities"] == [0.03, 0.95]
+    assert document["no_match_probability"] == pytest.approx(0.02)
+    assert document["covariance"] is None
+    shot.choose(0)
+    assert shot.result.chosen is calibrated
+    shot.result = replace(shot.result, registration=found)
     # The file is a start for the command line, and picture and scene show the same pose.
     folder = registered[1]
-    session.shot.choose(1)
+    shot.choose(1)
     (folder / "chosen.json").write_text(to_json(session.document()))
     start = read_pose(folder / "chosen.json")
-    assert start.T.tolist() == session.shot.answer.pose.transform.double().tolist()
+    assert start.T.tolist() == shot.answer.pose.transform.double().tolist()
     assert start.confidence is None
-    scene = trimesh.load(io.BytesIO(session.shot.glb()), file_type="glb")
+    scene = trimesh.load(io.BytesIO(shot.glb()), file_type="glb")
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    assert np.allclose(
-        flip @ scene.graph["object"][0], session.shot.answer.pose.transform, atol=1e-5
-    )
-    overlays = [session.shot.overlay()]
-    session.shot.choose(0)
-    assert session.shot.overlay() != overlays[0]
+    assert np.allclose(flip @ scene.graph["object"][0], shot.answer.pose.transform, atol=1e-5)
+    overlays = [shot.overlay()]
+    shot.choose(0)
+    assert shot.overlay() != overlays[0]
 
 
 def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
-    before = session.shot.answer.pose
-    describer = session.shot.result.registrar.describer
+    shot = session.shot
+    before = shot.answer.pose
+    describer = shot.result.registrar.describer
     centre = before.rotation @ describer.centre + before.translation
-    assert session.shot.result.answer_before is None
-    moved = session.shot.result.moved(
-        before.projection[0], rotation=(0, 6, 0), translation=(0.05, 0, 0)
-    )
-    session.shot.place(moved)
-    pose = session.shot.answer.pose
+    assert shot.result.answer_before is None
+    moved = shot.result.moved(before.projection[0], rotation=(0, 6, 0), translation=(0.05, 0, 0))
+    shot.place(moved)
+    pose = shot.answer.pose
     assert rotation_error(pose.rotation, before.rotation) == pytest.approx(6, abs=1e-4)
     shift = pose.rotation @ describer.centre + pose.translation - centre
     torch.testing.assert_close(shift, double([0.05 * describer.radius, 0, 0]))
     document = json.loads(to_json(session.document()))
     assert document["rotation"] == pose.rotation.tolist() == document["hypotheses"][0]["rotation"]
     assert len(document["hypotheses"]) == 2
-    for name in (
-        "confidence",
-        "no_match_probability",
-        "score",
-        "edge_support",
-        "covariance",
-        "ambiguous",
-    ):
+    unknown = ("confidence", "no_match_probability", "score", "edge_support")
+    for name in (*unknown, "covariance", "ambiguous"):
         assert document[name] is None, name
-    assert (document["reliable"], document["probabilities"], document["confidence_features"]) == (
-        False,
-        [],
-        {},
-    )
+    assert not document["reliable"]
+    assert (document["probabilities"], document["confidence_features"]) == ([], {})
     assert document["viewer"]["by_hand"] == ["moved: rotated 6.0 degrees, shifted 0.05 radii"]
-    session.shot.fit()
-    fitted = session.shot.answer
+    shot.fit()
+    fitted = shot.answer
     assert fitted.edits[1].startswith("contours fitted, edge support ")
     assert rotation_error(fitted.pose.rotation, before.rotation) < 1.5
     assert (fitted.pose.translation - before.translation).norm() < 0.03 * float(centre.norm())
     for answer in (pose, fitted.pose):  # one step back, and again
-        session.shot.undo()
-        assert session.shot.answer.pose is answer
-    session.shot.choose(1)
-    assert (session.shot.answer.edits, session.shot.result.answer_before) == ((), None)
+        shot.undo()
+        assert shot.answer.pose is answer
+    shot.choose(1)
+    assert (shot.answer.edits, shot.result.answer_before) == ((), None)
     with pytest.raises(InvalidInputError, match="touch the camera"):
-        session.shot.result.moved(moved, translation=(0, 0, -100))
+        shot.result.moved(moved, translation=(0, 0, -100))
 
 
 def test_the_python_program_gives_the_same_numbers(session, registered):
-    session.shot.choose(1)
+    shot = session.shot
+    shot.choose(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(registered[1])
         patch.setenv("CURVIREG_CACHE", str(registered[1] / "cache"))
@@ -202,12 +183,10 @@ def test_the_python_program_gives_the_same_numbers(session, registered):
         exec(program, names)
     assert "None" not in program, "no defaults"
     found = {name: double(names["pose"][name]) for name in ("rotation", "translation")}
-    assert rotation_error(found["rotation"], session.shot.answer.pose.rotation) < 0.1
-    assert torch.allclose(found["translation"], session.shot.answer.pose.translation, rtol=1e-3)
-    session.shot.place(
-        session.shot.result.moved(session.shot.answer.pose.projection[0], rotation=(0, 6, 0))
-    )
-    assert f"'rotation': {session.shot.answer.pose.rotation.tolist()}" in session.python()
+    assert rotation_error(found["rotation"], shot.answer.pose.rotation) < 0.1
+    assert torch.allclose(found["translation"], shot.answer.pose.translation, rtol=1e-3)
+    shot.place(shot.result.moved(shot.answer.pose.projection[0], rotation=(0, 6, 0)))
+    assert f"'rotation': {shot.answer.pose.rotation.tolist()}" in session.python()
 
 
 def test_the_python_program_says_what_boxes_are():
@@ -217,21 +196,22 @@ def test_the_python_program_says_what_boxes_are():
 
 
 def test_move_without_a_camera_keeps_the_allocentric_rotation(session, monkeypatch):
-    registrar = session.shot.result.registrar
+    shot = session.shot
+    registrar = shot.result.registrar
     monkeypatch.setattr(registrar, "mesh_is", "similar")  # no focal length is estimated
     session.set_camera()
     session.register()
-    assert session.shot.result.registrar is registrar, "the views are not rendered again"
-    before = session.shot.answer.pose
-    T = session.shot.answer.pose.projection[0]
-    session.shot.place(session.shot.result.moved(T, rotation=(0, 0, 5)))
-    pose = session.shot.answer.pose
+    assert shot.result.registrar is registrar, "the views are not rendered again"
+    before = shot.answer.pose
+    T = shot.answer.pose.projection[0]
+    shot.place(shot.result.moved(T, rotation=(0, 0, 5)))
+    pose = shot.answer.pose
     assert pose.translation is None
     assert rotation_error(pose.rotation, before.rotation) == pytest.approx(5, abs=1e-3)
     # A translation keeps the rotation of the projection and changes the allocentric one.
-    session.shot.place(session.shot.result.moved(pose.projection[0], translation=(0.1, 0, 0)))
-    assert torch.equal(session.shot.answer.pose.projection[0][:3, :3], pose.projection[0][:3, :3])
-    assert 0.1 < rotation_error(session.shot.answer.pose.rotation, pose.rotation) < 5
+    shot.place(shot.result.moved(pose.projection[0], translation=(0.1, 0, 0)))
+    assert torch.equal(shot.answer.pose.projection[0][:3, :3], pose.projection[0][:3, :3])
+    assert 0.1 < rotation_error(shot.answer.pose.rotation, pose.rotation) < 5
     assert session.document()["translation"] is None
 
 
@@ -376,20 +356,8 @@ def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
     session.open_mesh(folder / "truck.ply")
     with pytest.raises(InvalidInputError, match="180"):
         session.register()
-    words = [
-        "--near",
-        "10",
-        "-20.5",
-        "--within",
-        "30",
-        "--front=-x",
-        "--distance",
-        "0.5",
-        "2",
-        "--fov",
-        "65",
-    ]
-    session = new_session(*words)
+    words = "--near 10 -20.5 --within 30 --front=-x --distance 0.5 2 --fov 65"
+    session = new_session(*words.split())
     session.set_limits(azimuth=(315.0, 45.0), elevation=(-10.0, 40.0))
     again = register_options(parse(shlex.split(session.command())[1:]))
     assert (again.limits, again.guess) == (session.request().limits, 65)

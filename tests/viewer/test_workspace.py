@@ -298,12 +298,8 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
     for _ in range(2):
         asyncio.run(workspace.load_sample())
         options = session.options
-        assert (options.unit, options.pose, options.limits, options.mesh_is) == (
-            "mm",
-            "upright",
-            None,
-            None,
-        )
+        assert (options.unit, options.pose) == ("mm", "upright")
+        assert options.limits is options.mesh_is is None
         assert (options.camera, options.guess, names(workspace)) == (None, 30.0, ["coffee.jpg"])
     assert session.shot.photo.image.shape == (3, 400, 600)
     assert "CC0" in session.shot.photo.notes[0]
@@ -553,11 +549,7 @@ def test_a_full_disk_is_said_and_leaves_nothing(workspace, scene, monkeypatch):
         with pytest.raises(OutputError, match=message):
             send(workspace, scene / "photo.png", "a.png", b"1")
     with monkeypatch.context() as patch:
-        patch.setattr(
-            module.tempfile,
-            "mkdtemp",
-            full,
-        )
+        patch.setattr(module.tempfile, "mkdtemp", full)
         with pytest.raises(OutputError, match=message):
             send(workspace, scene / "photo.png", "a.png", b"1")
     assert (list(workspace.folder.iterdir()), workspace.receiving) == ([], {})

@@ -2,24 +2,22 @@
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.visualization.contours import contour_layer, contour_pixels
+from tests._support.numbers import double, eye
 
 FOCAL = 200.0
 SIZE = 120
-CAMERA = torch.tensor(
-    [[FOCAL, 0.0, 59.5], [0.0, FOCAL, 59.5], [0.0, 0.0, 1.0]], dtype=torch.float64
-)
+CAMERA = double([[FOCAL, 0.0, 59.5], [0.0, FOCAL, 59.5], [0.0, 0.0, 1.0]])
 GREEN = (0, 255, 80)
 ORANGE = (255, 170, 0)
 
 
 def placed(z):
-    T = torch.eye(4, dtype=torch.float64)
+    T = eye(4)
     T[2, 3] = z
     return T
 

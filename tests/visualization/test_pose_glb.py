@@ -14,6 +14,7 @@ from curvireg_torch.geometry import project_points, rotation_from_axis_angle
 from curvireg_torch.mesh import as_mesh
 from curvireg_torch.visualization import pose_glb
 from curvireg_torch.visualization.pose_glb import scene_glb
+from tests._support.numbers import eye
 from tests._support.scenes import CAMERA, SIZE, scene
 
 
@@ -88,7 +89,7 @@ def test_pose_glb_keeps_vertex_colours():
 
 @pytest.mark.parametrize(("z", "message"), [(-2.0, "behind the camera"), (torch.nan, "finite")])
 def test_pose_glb_refuses_unusable_poses(z, message):
-    T = torch.eye(4, dtype=torch.float64)
+    T = eye(4)
     T[2, 3] = z
     with pytest.raises(InvalidInputError, match=message):
         pose_glb(trimesh.creation.box(), T, CAMERA, torch.rand(3, *SIZE))
@@ -103,7 +104,7 @@ def test_scene_glb_places_each_camera_where_its_photograph_was_taken():
     K[1, 1] *= 1.25
     poses = []
     for degrees, shift in ((0.0, (0.1, 0.0, 0.0)), (25.0, (-0.2, 0.3, 0.1))):
-        pose = torch.eye(4, dtype=torch.float64)
+        pose = eye(4)
         pose[:3, :3] = rotation_from_axis_angle(
             torch.deg2rad(torch.tensor([0.1, 1.0, 0.3])) * degrees
         ).double()

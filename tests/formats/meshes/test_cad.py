@@ -84,16 +84,22 @@ def test_step_files_are_bounded_in_size_and_time(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("suffix", "package"), [("step", "cascadio"), ("igs", "cascadio"), ("dae", "collada")]
+    ("suffix", "package", "extra"),
+    [
+        ("step", "cascadio", "cad"),
+        ("igs", "cascadio", "cad"),
+        ("dae", "collada", "cad"),
+        ("usdz", "pxr", "usd"),
+    ],
 )
-def test_the_message_names_the_extra(write, monkeypatch, suffix, package):
+def test_the_message_names_the_extra(write, monkeypatch, suffix, package, extra):
     monkeypatch.setattr(extras, "find_spec", lambda _: None)
     with pytest.raises(MissingDependencyError, match=package) as caught:
         cr.load_mesh(write(f"a.{suffix}", "a part"))
-    assert "pip install 'curvireg_torch[cad]', in a checkout pip install -e '.[cad]'" in str(
-        caught.value
-    )
-    assert f"a.{suffix}: " in str(caught.value)
+    text = str(caught.value)
+    assert f"pip install 'curvireg_torch[{extra}]'" in text
+    assert f"in a checkout pip install -e '.[{extra}]'" in text
+    assert f"a.{suffix}: " in text
 
 
 @pytest.mark.slow
@@ -236,14 +242,7 @@ def test_hostile_collada_files_are_refused(refused):
 ITEM = '<item objectid="1"/>'
 
 
-def threemf(
-    path,
-    resources,
-    items=ITEM,
-    *,
-    unit='unit="inch"',
-    more=None,
-):
+def threemf(path, resources, items=ITEM, *, unit='unit="inch"', more=None):
     namespace = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
     text = (
         f'<?xml version="1.0"?><model {unit} xmlns="{namespace}" xmlns:m="materials" '
@@ -336,29 +335,16 @@ def test_threemf_reads_colours_and_textures(tmp_path, load):
     group = (
         '<m:colorgroup id="6"><m:color color="#00FF00"/><m:color color="#000000"/></m:colorgroup>'
     )
-    mesh, _ = load(
-        threemf(
-            tmp_path / "a.3mf",
-            group + solid(1, "", 'pid="6" p1="0" p2="1" p3="0"'),
-        )
-    )
-    colours = mesh.colours
-    assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
     # a corner without an entry has that of the first
-    few = group + solid(1, "", 'pid="6" p1="0" p2="1"')
-    colours = load(threemf(tmp_path / "a.3mf", few))[0].colours
-    assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
+    for words in ('p1="0" p2="1" p3="0"', 'p1="0" p2="1"'):
+        resources = group + solid(1, "", f'pid="6" {words}')
+        colours = load(threemf(tmp_path / "a.3mf", resources))[0].colours
+        assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
     pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "a.png")
-    texture = (
-        '<m:texture2d id="7" path="/3D/a.png" contenttype="image/png"/><m:texture2dgroup '
-        'id="8" '
-        'texid="7">'
-    )
-    texture += (
-        '<m:tex2coord u="0" v="0"/><m:tex2coord u="1" v="0"/><m:tex2coord u="0" '
-        'v="1"/></m:texture2dgroup>'
-    )
+    texture = '<m:texture2d id="7" path="/3D/a.png" contenttype="image/png"/>'
+    texture += '<m:texture2dgroup id="8" texid="7"><m:tex2coord u="0" v="0"/>'
+    texture += '<m:tex2coord u="1" v="0"/><m:tex2coord u="0" v="1"/></m:texture2dgroup>'
     resources = texture + solid(1, "", 'pid="8" p1="0" p2="1" p3="2"')
     pictures = {"3D/a.png": (tmp_path / "a.png").read_bytes()}
     mesh, texts = load(threemf(tmp_path / "a.3mf", resources, more=pictures))

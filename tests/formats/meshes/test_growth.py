@@ -22,6 +22,7 @@ from curvireg_torch.utils.programs import run_program
 from tests.formats.meshes.step import step_file
 from tests.formats.meshes.test_cad import collada
 from tests.formats.meshes.test_cad import threemf as write_threemf
+from tests.formats.meshes.test_gltf import skinned
 from tests.formats.meshes.test_hostile_meshes import tree
 
 UNUSED = 30_000  # vertices
@@ -171,45 +172,19 @@ def test_bytes_of_a_shared_image_are_made_once(tmp_path, monkeypatch):
 def test_joints_of_a_skin_are_placed_once(tmp_path, monkeypatch):
     joints = Mock(wraps=gltf._File._joints)
     placed = Mock(wraps=np.stack)
-    attributes = {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2}
-    content = tree(
-        nodes=[{"mesh": 0, "skin": 0}] * 20 + [{"translation": [0, 0, 2]}],
-        scenes=[{"nodes": list(range(21))}],
-        meshes=[{"primitives": [{"attributes": attributes}]}],
-        skins=[{"joints": [20]}],
-    )
-    content["bufferViews"].append({"buffer": 1, "byteLength": 24})
-    content["buffers"].append(
-        {
-            "byteLength": 24,
-            "uri": "data:;base64,"
-            + base64.b64encode(bytes(12) + bytes([255, 0, 0, 0] * 3)).decode(),
-        }
-    )
-    content["accessors"] += [
-        {"bufferView": 1, "componentType": 5121, "count": 3, "type": "VEC4"},
-        {
-            "bufferView": 1,
-            "byteOffset": 12,
-            "componentType": 5121,
-            "count": 3,
-            "type": "VEC4",
-            "normalized": True,
-        },
-    ]
+    whole = skinned([0] * 4, [1, 0, 0, 0], {"translation": [0, 0, 2]})
+    whole.content["nodes"] += [{"mesh": 0, "skin": 0}] * 19
+    whole.content["scenes"] = [{"nodes": list(range(21))}]
     monkeypatch.setattr(gltf._File, "_joints", lambda self, index: joints(self, index))
     monkeypatch.setattr(gltf.np, "stack", placed)
-    path = tmp_path / "a.gltf"
-    path.write_text(json.dumps(content))
     monkeypatch.setattr(gltf, "SKINNED_AT_ONCE", 2)  # blocks of one part
-    found = files.read_source(MeshSource(path))
+    found = files.read_source(MeshSource(whole.write(tmp_path / "a.gltf")))
     assert (found.vertices[:, 2] == 2.0).all()
     assert found.vertices[:3].tolist() == [[0, 0, 2], [1, 0, 2], [0, 1, 2]]
     assert (joints.call_count, placed.call_count) == (20, 1)
-    content["skins"] = [{"joints": [20] * 100_001}]
-    path.write_text(json.dumps(content))
+    whole.content["skins"] = [{"joints": [1] * 100_001}]
     with pytest.raises(MeshError, match="more than 100,000 joints"):
-        cr.load_mesh(path)
+        cr.load_mesh(whole.write(tmp_path / "a.gltf"))
 
 
 def test_names_outside_of_the_folder_are_counted(tmp_path, monkeypatch):

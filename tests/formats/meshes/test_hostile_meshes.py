@@ -236,10 +236,9 @@ def test_divide_faces_counts_before_it_divides(tmp_path, monkeypatch):
         assert len(cr.load_mesh(tmp_path / name).faces) == 20
         monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 159)
         refused(tmp_path / name, content, "not convex have too many corners")
-        monkeypatch.setattr(limits, "MAX_MESH_FACES", 19)
-        refused(tmp_path / name, content, "more than 19 faces")
-        monkeypatch.setattr(limits, "MAX_MESH_LINES", 9)
-        refused(tmp_path / name, content, "more than 9 lines")
+        for limit, value, words in (("FACES", 19, "19 faces"), ("LINES", 9, "9 lines")):
+            monkeypatch.setattr(limits, f"MAX_MESH_{limit}", value)
+            refused(tmp_path / name, content, f"more than {words}")
     monkeypatch.undo()
     monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 160)
     assert len(cr.load_mesh(tmp_path / "a.off").faces) == 20

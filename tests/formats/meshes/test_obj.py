@@ -51,9 +51,8 @@ def write(folder, library, name="a.mtl"):
 @pytest.mark.parametrize("first", ["v", "mtllib", "comment", "o"])
 def test_every_encoding_gives_the_same_mesh(tmp_path, write, load, encoding, first):
     name = {"latin-1": "Gehäuse", "gbk": "外壳"}.get(encoding, "part")
-    text = {"v": "", "mtllib": "mtllib m.mtl\n", "comment": f"# {name}\n", "o": f"o {name}\n"}[
-        first
-    ] + BOX
+    starts = {"v": "", "mtllib": "mtllib m.mtl\n", "comment": f"# {name}\n", "o": f"o {name}\n"}
+    text = starts[first] + BOX
     (tmp_path / "m.mtl").write_text("newmtl a\nKd 0.8 0.1 0.1\n")
     if encoding == "utf-16-le-mark":
         data = b"\xff\xfe" + text.encode("utf-16-le")
@@ -70,21 +69,16 @@ def test_materials_of_all_libraries_and_none_without_a_name(tmp_path, write, loa
     (tmp_path / "b c.mtl").write_text("newmtl blue\nKd 0 0 1\n")
     (tmp_path / "b.mtl").write_text("newmtl blue\nKd 0 0 1\n")
     body = f"{POINTS}usemtl red\n{HALVES[0]}usemtl blue\n{HALVES[1]}"
-    for head in (
-        "mtllib a.mtl\nmtllib b.mtl\n",
-        "mtllib a.mtl b.mtl\n",
-        "mtllib a.mtl\nmtllib b c.mtl\n",
-    ):
-        mesh, texts = load(write("a.obj", head + body))
+    for names in ("a.mtl\nmtllib b.mtl", "a.mtl b.mtl", "a.mtl\nmtllib b c.mtl"):
+        mesh, texts = load(write("a.obj", f"mtllib {names}\n{body}"))
         colours = mesh.colours
         assert not texts
         assert (colours.corners[:6] == [255, 0, 0]).all()
         assert (colours.corners[6:] == [0, 0, 255]).all()
     mesh, texts = load(write("a.obj", "mtllib a.mtl\n" + body))
     assert "lack the material blue" in texts[0]
-    colours = load(
-        write("a.obj", f"mtllib a.mtl\n{POINTS}usemtl red\n{HALVES[0]}usemtl\n{HALVES[1]}")
-    )[0].colours
+    nameless = body.replace("usemtl blue", "usemtl")
+    colours = load(write("a.obj", "mtllib a.mtl\n" + nameless))[0].colours
     assert (colours.corners[6:] == 255).all(), "no name: no material"
 
 
@@ -106,14 +100,7 @@ def test_materials_of_all_libraries_and_none_without_a_name(tmp_path, write, loa
     "name",
     ["label.png", "my label.png", "LABEL.PNG", '"label.png"', "maps\\label.png", "./label.png"],
 )
-def test_options_of_a_texture_precede_its_name(
-    tmp_path,
-    load,
-    options,
-    scale,
-    offset,
-    name,
-):
+def test_options_of_a_texture_precede_its_name(tmp_path, load, options, scale, offset, name):
     folder = tmp_path / "maps" if "maps" in name else tmp_path
     file = name.replace("maps\\", "").strip('"')
     pixels = picture(folder / (file.lower() if name.isupper() else file))
@@ -141,16 +128,12 @@ def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_i
     tmp_path, load
 ):
     picture(tmp_path / "images" / "label.png")
-    for name in (
-        "../images/label.png",
-        str(tmp_path / "images" / "label.png"),
-        "C:\\art\\label.png",
-    ):
+    outside = str(tmp_path / "images" / "label.png")
+    for name in ("../images/label.png", outside, "C:\\art\\label.png"):
         path = write(tmp_path / "models", f"newmtl label\nmap_Kd {name}\n")
-        mesh, texts = load(path)
+        mesh, (text,) = load(path)
         assert not mesh.has_colours
-        assert len(texts) == 1
-        assert "label.png" in texts[0]
+        assert "label.png" in text
         assert [warning.kind for warning in mesh.warnings] == ["texture"]
         mesh, texts = load(path, textures=tmp_path / "images")
         assert mesh.has_colours
@@ -166,30 +149,20 @@ def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_i
 
 def test_colours_behind_the_coordinates(write, load):
     for scale in (1, 255):
-        points = "".join(
+        shaded = [
             f"{line} {k % 2 * scale} 0 {scale}\n" for k, line in enumerate(POINTS.splitlines())
-        )
-        colours = load(write("a.obj", points + "".join(HALVES)))[0].colours
-        assert set(map(tuple, colours.corners.reshape(-1, 3).tolist())) == {
-            (0, 0, 255),
-            (255, 0, 255),
-        }
+        ]
+        colours = load(write("a.obj", "".join([*shaded, *HALVES])))[0].colours
+        found = set(map(tuple, colours.corners.reshape(-1, 3).tolist()))
+        assert found == {(0, 0, 255), (255, 0, 255)}
 
 
-def test_corners_of_several_forms_in_one_file(tmp_path, write, load):
-    faces = (
-        "".join(HALVES)
-        .replace("f 1 3 4\n", "f 1/1 3/2/1 4\n")
-        .replace("f 3 8 4\n", "f 3//1 8/ 4//\n")
-    )
-    np.testing.assert_array_equal(
-        load(write("a.obj", POINTS + UV + "vn 0 0 1\n" + faces))[0].faces, load_box(tmp_path).faces
-    )
-
-
-def load_box(folder):
-    (folder / "plain.obj").write_text(BOX)
-    return cr.load_mesh(folder / "plain.obj")
+def test_corners_of_several_forms_in_one_file(write, load):
+    plain, _ = load(write("plain.obj", BOX))
+    faces = "".join(HALVES).replace("f 1 3 4\n", "f 1/1 3/2/1 4\n")
+    faces = faces.replace("f 3 8 4\n", "f 3//1 8/ 4//\n")
+    mesh, _ = load(write("a.obj", POINTS + UV + "vn 0 0 1\n" + faces))
+    np.testing.assert_array_equal(mesh.faces, plain.faces)
 
 
 @pytest.mark.parametrize(

@@ -19,13 +19,13 @@ from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, colour_by
 from curvireg_torch.mesh.colours import colours_of_parts
 from curvireg_torch.utils.extras import is_installed
 from tests.formats.meshes.test_cad import solid, threemf
-from tests.formats.meshes.test_gltf import Tree
+from tests.formats.meshes.test_gltf import TRIANGLE, Tree, coordinates, skinned, textured
 from tests.formats.meshes.test_ply import header, rows
 from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, painted, square, stage
 
 needs_usd = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
 pytestmark = pytest.mark.usefixtures("here")
-TRIANGLE = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]
+
 RED = [255, 0, 0]
 GREEN = [0, 255, 0]
 BLUE = [0, 0, 255]
@@ -77,26 +77,23 @@ def test_a_node_is_scaled_then_turned_then_moved_in_the_frame_of_its_parent(
     np.testing.assert_allclose(mesh.vertices, expected, atol=1e-6)
 
 
-def skinned(joints, weights, *nodes, **skin):
-    """A triangle with a skin, whose joints are these nodes."""
-    tree = Tree()
-    part = tree.part(None, TRIANGLE)
-    part["attributes"]["JOINTS_0"] = tree.array([joints] * 3, "B")
-    part["attributes"]["WEIGHTS_0"] = tree.array([weights] * 3)
-    numbers = [*range(1, len(nodes) + 1)]
-    binds = {name: tree.array(values.reshape(1, 16)) for name, values in skin.items()}
-    tree.content["skins"] = [{"joints": numbers, **binds}]
-    tree.content["nodes"] = [{"mesh": 0, "skin": 0}, *nodes]
-    tree.content["scenes"] = [{"nodes": [0, *numbers]}]
-    return tree
-
-
 def test_a_joint_moves_what_its_inverse_bind_matrix_has_moved(tmp_path):
     bind = np.eye(4)
     bind[3, 0] = 4.0  # by column: a shift along x
     tree = skinned([0] * 4, [1, 0, 0, 0], {"rotation": QUARTER}, inverseBindMatrices=bind)
     mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
     np.testing.assert_allclose(mesh.vertices, [[0, 4, 0], [0, 5, 0], [-1, 4, 0]], atol=1e-6)
+
+
+def test_joints_stand_in_the_frames_of_their_parents(tmp_path):
+    """The place of the node that has the skin does not count."""
+    joints = [[0] * 4, [1] * 4, [1] * 4]
+    nodes = {"translation": [0, 5, 0], "children": [2]}, {"translation": [3, 0, 0]}
+    tree = skinned(joints, [1, 0, 0, 0], *nodes)
+    tree.content["nodes"][0]["translation"] = [100, 0, 0]
+    tree.content["scenes"] = [{"nodes": [0, 1]}]
+    mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
+    np.testing.assert_allclose(mesh.vertices, [[0, 5, 0], [4, 5, 0], [3, 6, 0]], atol=1e-6)
 
 
 def test_weights_of_joints_are_shares(tmp_path):
@@ -111,23 +108,6 @@ def test_the_least_integer_of_a_fraction_is_minus_one(tmp_path):
     tree.content["meshes"] = [{"primitives": [{"attributes": {"POSITION": positions}}]}]
     mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
     assert mesh.bounds.tolist() == [[-1, -1, 0], [1, 0, 0]]
-
-
-def textured(more, material=None):
-    """A triangle with two sets of coordinates, and a texture; ``more`` is said of its use."""
-    tree = Tree()
-    part = tree.part(None, TRIANGLE, material=0)
-    part["attributes"]["TEXCOORD_0"] = tree.array([[0, 0], [1, 0], [0, 0.5]])
-    part["attributes"]["TEXCOORD_1"] = tree.array([[0.25, 0], [0.25, 0], [0.25, 0]])
-    tree.picture(np.full((4, 4, 3), 255, np.uint8))
-    used = {"baseColorTexture": {"index": 0, **more}, "baseColorFactor": [1, 0, 0, 1]}
-    tree.content["materials"] = [material or {"pbrMetallicRoughness": used}]
-    return tree
-
-
-def coordinates(mesh):
-    colours = mesh.colours
-    return colours.uv[0] * [1, -1] + [0, 1]  # from the top left, as in glTF
 
 
 def test_the_set_that_a_transform_names_wins(tmp_path):
@@ -149,6 +129,16 @@ def test_specular_colours_win_over_metallic_ones(tmp_path):
     mesh = cr.load_mesh(textured({}, material).write(tmp_path / "a.gltf"))
     assert (first_corners(mesh), textures(mesh)) == ([BLUE], [WHITE])
     assert mesh.colours.textures == ()
+
+
+def test_a_part_without_a_texture_keeps_its_own_colour(tmp_path):
+    tree = textured({})
+    tree.part(None, np.add(TRIANGLE, 5), material=1)
+    blue = {"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 1, 1]}}
+    tree.content["materials"].append(blue)
+    mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
+    assert mesh.colours.texture.tolist() == [0, -1]
+    assert first_corners(mesh) == [RED, BLUE]
 
 
 def test_a_picture_as_webp_wins(tmp_path):

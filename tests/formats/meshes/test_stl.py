@@ -65,35 +65,22 @@ def test_a_binary_file_whose_number_of_faces_was_never_written_is_refused(refuse
     refused("a.stl", binary(claimed=0), "says 0 faces and holds 12: it was cut")
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        ascii_stl().encode(),
-        ascii_stl().upper().encode(),
-        ascii_stl(point="\t\tvertex\t{:.4f}\t{:.4f} {:e}\n").encode(),
-        ascii_stl("Gehäuse").encode("latin-1"),
-        ascii_stl("外壳").encode("gbk"),
-        ascii_stl("vertex_plate facet").encode(),
-        ascii_stl("vertex 1 2 3").encode("utf-8-sig"),
-        ascii_stl().encode("utf-16"),
-        ascii_stl().replace("\n", "\r\n").encode(),
-        ascii_stl().replace("\n", "\r").encode(),
-        ("\n \n" + ascii_stl()).encode(),
-    ],
-    ids=[
-        "plain",
-        "upper",
-        "tabs",
-        "latin-1",
-        "gbk",
-        "named",
-        "bom",
-        "utf-16",
-        "crlf",
-        "cr",
-        "blank",
-    ],
-)
+ASCII = {
+    "plain": ascii_stl().encode(),
+    "upper": ascii_stl().upper().encode(),
+    "tabs": ascii_stl(point="\t\tvertex\t{:.4f}\t{:.4f} {:e}\n").encode(),
+    "latin-1": ascii_stl("Gehäuse").encode("latin-1"),
+    "gbk": ascii_stl("外壳").encode("gbk"),
+    "named": ascii_stl("vertex_plate facet").encode(),
+    "bom": ascii_stl("vertex 1 2 3").encode("utf-8-sig"),
+    "utf-16": ascii_stl().encode("utf-16"),
+    "crlf": ascii_stl().replace("\n", "\r\n").encode(),
+    "cr": ascii_stl().replace("\n", "\r").encode(),
+    "blank": ("\n \n" + ascii_stl()).encode(),
+}
+
+
+@pytest.mark.parametrize("content", ASCII.values(), ids=ASCII)
 def test_ascii_files_of_every_encoding(write, load, content):
     mesh, texts = load(write("a.stl", content))
     check(mesh)

@@ -1,7 +1,6 @@
 """Textures of unknown origin: which formats are decoded, and how much of them."""
 
 import base64
-import json
 from io import BytesIO
 
 import numpy as np
@@ -13,20 +12,12 @@ import curvireg_torch as cr
 from curvireg_torch.formats.meshes import colours, source
 from curvireg_torch.mesh import as_mesh
 from tests._support.quick import slow_after
-from tests.formats.meshes.test_hostile_meshes import tree
+from tests.formats.meshes.test_files import write as write_mesh
 from tests.formats.meshes.test_obj import write as write_obj
 
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n"
-FORMATS = {"JPEG": True, "PNG": True, "TIFF": True, "WEBP": True, "BMP": True, "PPM": True}
-FORMATS |= {
-    "GIF": False,
-    "TGA": False,
-    "PCX": False,
-    "ICO": False,
-    "EPS": False,
-    "PDF": False,
-    "SGI": False,
-}
+FORMATS = dict.fromkeys(("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM"), True)
+FORMATS |= dict.fromkeys(("GIF", "TGA", "PCX", "ICO", "EPS", "PDF", "SGI"), False)
 
 
 def encoded(kind, size=(8, 8), **how):
@@ -39,33 +30,12 @@ def encoded(kind, size=(8, 8), **how):
 
 
 def write(folder, carrier, picture):
-    """A mesh of one format whose texture is called a.png, whatever it holds."""
-    (folder / "a.png").write_bytes(picture)
-    if carrier == "obj":
-        return write_obj(folder, "newmtl label\nmap_Kd a.png\n")
-    path = folder / f"a.{carrier}"
-    if carrier == "ply":
-        text = "ply\nformat ascii 1.0\ncomment TextureFile a.png\nelement vertex 3\n"
-        text += "".join(f"property float {name}\n" for name in "xyzst") + "element face 1\n"
-        text += (
-            "property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n1 0 0 1 0\n0 1 0 "
-            "0 "
-            "1\n3 0 1 2\n"
-        )
-        path.write_text(text)
-        return path
-    uri = "data:image/png;base64," + base64.b64encode(picture).decode()
-    content = tree(
-        images=[{"uri": "a.png"} if carrier == "gltf" else {"uri": uri}],
-        textures=[{"source": 0}],
-        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-        meshes=[{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
-    )
-    content["accessors"].append(
-        {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}
-    )
-    path = folder / "a.gltf"
-    path.write_text(json.dumps(content))
+    """A mesh of one format whose texture is called picture.png, whatever it holds."""
+    path = write_mesh(folder, "gltf" if carrier == "data" else carrier)
+    (folder / "picture.png").write_bytes(picture)
+    if carrier == "data":
+        uri = "data:image/png;base64," + base64.b64encode(picture).decode()
+        path.write_text(path.read_text().replace("picture.png", uri))
     return path
 
 
@@ -93,9 +63,7 @@ def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path):
 
 def test_pixels_of_all_textures_together_are_bounded(tmp_path, load, monkeypatch):
     picture = encoded("PNG", (40, 25))
-    path = write(tmp_path, "obj", picture)
-    library = "".join(f"newmtl m{k}\nmap_Kd {k}.png\n" for k in range(4))
-    (tmp_path / "a.mtl").write_text(library)
+    path = write_obj(tmp_path, "".join(f"newmtl m{k}\nmap_Kd {k}.png\n" for k in range(4)))
     for k in range(4):
         (tmp_path / f"{k}.png").write_bytes(picture)
     head, _, faces = path.read_text().partition("usemtl label\n")
@@ -105,13 +73,9 @@ def test_pixels_of_all_textures_together_are_bounded(tmp_path, load, monkeypatch
     monkeypatch.setattr(source, "MAX_TEXTURE_PIXELS", 3999)
     monkeypatch.setattr(colours, "MAX_TEXTURE_PIXELS", 3999)
     mesh, texts = load(path)
-    found = mesh.colours
-    assert len(found.textures) == 3
-    assert len(texts) == 1
-    assert (
-        "the texture 3.png cannot be used (the textures have more than 3,999 pixels together)"
-        in texts[0]
-    )
+    assert len(mesh.colours.textures) == 3
+    (text,) = texts
+    assert "3.png cannot be used (the textures have more than 3,999 pixels together)" in text
     monkeypatch.setattr(source, "MAX_TEXTURE_PIXELS", 4000)
     assert not load(path)[1]
 
@@ -126,7 +90,7 @@ def test_a_texture_of_many_pixels_or_scans_is_left_out(tmp_path, load, monkeypat
     monkeypatch.setattr("curvireg_torch.utils.pictures.MAX_IMAGE_SCANS", 5)
     assert "scans, more than 5" in load(path)[1][0]
     path = write(tmp_path, "obj", encoded("PNG")[:60])
-    assert "a.png cannot be used" in load(path)[1][0]
+    assert "picture.png cannot be used" in load(path)[1][0]
 
 
 @pytest.mark.parametrize(
@@ -134,10 +98,9 @@ def test_a_texture_of_many_pixels_or_scans_is_left_out(tmp_path, load, monkeypat
 )
 def test_large_textures_are_reduced_in_every_mode(mode):
     """Before they are converted to RGBA, which would take four times the memory."""
+    size = (6400, 5600)
     image = (
-        Image.new("L", (6400, 5600), 255).convert(mode)
-        if mode != "I;16"
-        else Image.new(mode, (6400, 5600), 65535)
+        Image.new(mode, size, 65535) if mode == "I;16" else Image.new("L", size, 255).convert(mode)
     )
     file = BytesIO()
     image.save(file, "TIFF")
@@ -149,21 +112,5 @@ def test_large_textures_are_reduced_in_every_mode(mode):
 
 
 def test_a_mesh_without_any_colour_has_none(write):
-    assert (
-        cr.load_mesh(
-            write("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n")
-        ).colours
-        is None
-    )
-
-
-def test_colours_and_coordinates_stay_at_the_corners_of_a_mirrored_face():
-    painting = colours.Painting(1)
-    painting.corners[:] = [[[1, 0, 0], [2, 0, 0], [3, 0, 0]]]
-    texture = np.zeros((1, 1, 3), np.uint8)
-    painting.add_texture([0], texture, np.array([[[0.0, 0.1], [0.0, 0.2], [0.0, 0.3]]]))
-    mesh = source.ReadMesh(np.eye(3), np.array([[0, 1, 2]]), painting.finished())
-    mirrored = mesh.transformed(np.diag([-1.0, 1.0, 1.0, 1.0]))
-    assert mirrored.faces.tolist() == [[2, 1, 0]]
-    assert mirrored.colours.corners[0, :, 0].tolist() == [3, 2, 1]
-    np.testing.assert_allclose(mirrored.colours.uv[0, :, 1], [0.3, 0.2, 0.1])
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n"
+    assert cr.load_mesh(write("a.obj", text)).colours is None

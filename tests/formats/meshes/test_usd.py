@@ -8,11 +8,10 @@ import pytest
 from PIL import Image
 
 import curvireg_torch as cr
-from curvireg_torch.errors import MeshError, MissingDependencyError
+from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import usd
 from curvireg_torch.formats.meshes.files import mesh_files
 from curvireg_torch.mesh.colours import colours_at
-from curvireg_torch.utils import extras
 from curvireg_torch.utils.extras import is_installed
 
 pytestmark = [
@@ -67,6 +66,17 @@ def square(more="", api="", counts="4", indices="0, 1, 2, 3"):
 def stage(*parts, about='metersPerUnit = 0.001\n    upAxis = "Z"', place=""):
     body = "\n".join(parts)
     return f'#usda 1.0\n(\n    {about}\n)\ndef Xform "part"\n{{\n{place}{body}\n}}\n'
+
+
+def painted(colour):
+    file = BytesIO()
+    Image.new("RGB", (4, 4), colour).save(file, "PNG")
+    return file.getvalue()
+
+
+def textures_of(mesh):
+    colours = mesh.colours
+    return [texture[0, 0].tolist() for texture in colours.textures]
 
 
 def png():
@@ -158,17 +168,6 @@ def test_textures_by_the_coordinates_that_they_name(tmp_path, load, kind):
     if kind == "usda":
         (tmp_path / "textures" / "print.png").unlink()
         assert any("print.png is missing" in text for text in load(path)[1])
-
-
-def painted(colour):
-    file = BytesIO()
-    Image.new("RGB", (4, 4), colour).save(file, "PNG")
-    return file.getvalue()
-
-
-def textures_of(mesh):
-    colours = mesh.colours
-    return [texture[0, 0].tolist() for texture in colours.textures]
 
 
 def test_textures_lie_beside_the_file_that_names_them(tmp_path, load):
@@ -280,9 +279,3 @@ def test_bounds(tmp_path, monkeypatch):
         with pytest.raises(MeshError, match=match):
             cr.load_mesh(path, unit="mm")
         monkeypatch.undo()
-
-
-def test_the_message_names_the_extra(write, monkeypatch):
-    monkeypatch.setattr(extras, "find_spec", lambda _: None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'curvireg_torch\[usd\]'"):
-        cr.load_mesh(write("part.usdz", "a part"))
