@@ -347,8 +347,7 @@ are smaller, and a fit takes ten times as long as a step."""
 
 WITHIN_REACH = 4.0
 """Multiple of the clear deviation up to which, at the fitted pose, a focal length is worth a fit: a
-fit lowers the deviation, where the given focal length is 1.3 times the right one to less than a
-half."""
+fit lowers the deviation, to a third where the given one is 1.3 times the right focal length."""
 
 LARGEST_CHANGE = 2.0
 WIDE = 2.0
