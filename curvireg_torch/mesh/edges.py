@@ -12,10 +12,6 @@ WELD = 1e-6  # Vertices nearer than this fraction of the mesh's longest side are
 CREASE_ANGLE = 15.0  # Degrees between two faces from which their common edge is a crease
 # Degrees between two faces below which the surface counts as smooth across their edge
 SMOOTH_ANGLE = 40.0
-FLAT = 1e-9  # Sine of the angle between two faces up to which they lie in one plane
-# Fraction of edges without two faces in opposite directions, and of faces whose surface is inside
-# out, up to which a mesh counts as solid: simplifying leaves a few
-MAX_DEFECTS = 2e-3
 # Faces of an edge that are looked at; polygon soups have edges with more than two
 MAX_EDGE_FACES = 4
 
@@ -31,10 +27,6 @@ class MeshEdges:
         edges: (E, 2) vertices of each edge.
         normals: (V, 3) float32 unit vectors, means of the normals of the faces around each vertex.
         is_crease, is_smooth: (E,) bool.
-        is_solid: whether the faces enclose volumes, with their outer sides outside, apart from a
-            few defects.
-        is_concave: (E,) bool, edges of a solid along which its faces meet in a hollow: there the
-            solid hides its own contour from every side.
     """
 
     def __init__(self, mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> None:
@@ -72,22 +64,11 @@ class MeshEdges:
         angle = np.where(boundary, 0.0, np.pi - np.arccos(np.clip(cosine, -1.0, 1.0)))
         self.is_crease = (angle > math.radians(CREASE_ANGLE)) | many
         self.is_smooth = (angle < math.radians(SMOOTH_ANGLE)) & ~boundary & ~many
-        has_two_sides = (count == 2) & (signs[:, 0] != signs[:, 1])
-        is_outside = _body_volumes(vertices, faces) > 0
-        defects = max(1.0 - has_two_sides.mean(), 1.0 - is_outside.mean())
-        self.is_solid = bool(defects <= MAX_DEFECTS)
-        outward = normal[self._edge_faces[:, 0]]
-        self.is_concave = self.is_solid & ((outward * inward[:, 1]).sum(axis=1) > FLAT)
         total = np.zeros_like(vertices)
         for k in range(3):
             np.add.at(total, faces[:, k], self._plane)
         normals = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
         self.normals: np.ndarray = normals.astype(np.float32)
-
-    def outer_sides(self) -> np.ndarray:
-        """(E,) bool: on which side :func:`occluding_edges` sees each edge of a solid from outside
-        its first face."""
-        return np.asarray(self._flips[0])
 
     def side_planes(self) -> np.ndarray:
         """(k, E, 4) float64 planes (n, d) of the faces of each edge, as :func:`occluding_edges`
@@ -133,19 +114,11 @@ def encloses_volumes(mesh: trimesh.Trimesh) -> bool:
     back = np.sort(b * len(vertices) + a)
     if not len(along) or (along != back).any() or not (np.diff(along) > 0).all():
         return False
-    places = np.zeros_like(vertices)
-    places[number] = vertices
-    return bool((_body_volumes(places, corners) > 0).all())
-
-
-def _body_volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(F,) the volume that the connected surface of each face encloses, below 0 where it is inside
-    out."""
     body = trimesh.graph.connected_component_labels(
-        faces[:, [0, 1, 1, 2]].reshape(-1, 2), node_count=len(vertices)
-    )[faces[:, 0]]
-    six_times = np.bincount(body, np.linalg.det(vertices[faces] - vertices.mean(axis=0)))
-    return np.asarray(six_times[body] / 6.0)
+        np.column_stack([a, b]), node_count=len(vertices)
+    )[corners[:, 0]]
+    volume = np.bincount(body, np.linalg.det(vertices[faces[has_area]] - vertices.mean(axis=0)))
+    return bool((volume[np.unique(body)] > 0).all())
 
 
 def simplified(

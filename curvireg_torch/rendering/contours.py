@@ -147,9 +147,6 @@ class _Level:
         self.ends = self._tensor(edges.edges[:, 1], torch.long).contiguous()
         self.normals = self._tensor(edges.normals, torch.float32)
         self.creases = self._tensor(edges.is_crease.nonzero()[0], torch.long)
-        self.is_solid = edges.is_solid
-        self.is_concave = self._tensor(edges.is_concave, torch.bool)
-        self.crease_sides = self._tensor(edges.outer_sides()[edges.is_crease], torch.bool)
         self.is_smooth = self._tensor(edges.is_smooth, torch.bool)
         self.side_planes = self._tensor(edges.side_planes(), torch.float64)
         self.visibility = _visibility(edges.vertices / radius, edges.faces, device)
@@ -218,7 +215,7 @@ class _Views:
         return ContourPoints.cat_within([occluding, creases])
 
     def _on_occluding_contours(self, density: float) -> ContourPoints:
-        pose, edge = (self.on_contour & ~self.level.is_concave).nonzero().unbind(1)
+        pose, edge = self.on_contour.nonzero().unbind(1)
         places = self._spread(pose, edge, round(density * OCCLUDING_CANDIDATES))
         places = self._smoothed(places)
         outside = _rays_to(places.at) + (ASIDE / self.focal_lengths) * places.normal
@@ -228,14 +225,9 @@ class _Views:
 
     def _on_creases(self, density: float) -> ContourPoints:
         creases = self.level.creases
-        faces_camera = ~self.on_contour.index_select(1, creases)
-        count = CREASE_CANDIDATES
-        if self.level.is_solid:
-            faces_camera &= self.side.index_select(1, creases) == self.level.crease_sides
-            count //= 2
-        pose, number = faces_camera.nonzero().unbind(1)
+        pose, number = (~self.on_contour.index_select(1, creases)).nonzero().unbind(1)
         edge = _taken(creases, number)
-        places = self._spread(pose, edge, round(density * count))
+        places = self._spread(pose, edge, round(density * CREASE_CANDIDATES))
         is_fold = self._is_fold(places)
         no_outline = torch.zeros_like(is_fold)
         return self._chosen(places, is_fold, no_outline, round(density * MAX_CREASES))

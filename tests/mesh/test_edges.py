@@ -87,56 +87,6 @@ def test_the_contour_of_a_book_is_its_spine_where_all_pages_lie_on_one_side():
     assert found == expected
 
 
-def boxes(*, inside_out=()):
-    """Two boxes side by side, those of ``inside_out`` inside out."""
-    parts = [trimesh.creation.box((1, 1, 1)), trimesh.creation.box((1, 2, 1))]
-    parts[1].apply_translation((3, 0, 0))
-    for k in inside_out:
-        parts[k].invert()
-    return trimesh.util.concatenate(parts)
-
-
-def ball(holes):
-    """A sphere of 5,120 faces and 7,680 edges, without so many of the faces, each apart."""
-    mesh = trimesh.creation.icosphere(subdivisions=4)
-    mesh.update_faces(np.arange(len(mesh.faces)) >= 4 * holes + (np.arange(len(mesh.faces)) % 4))
-    return mesh
-
-
-@pytest.mark.parametrize(
-    ("mesh", "is_solid"),
-    [
-        (boxes(), True),
-        (boxes(inside_out=[0]), False),
-        (boxes(inside_out=[0, 1]), False),
-        (trimesh.Trimesh(boxes().vertices, boxes().faces[1:], process=False), False),
-        (ball(holes=0), True),
-        (ball(holes=4), True),  # 12 of the edges have one face
-        (ball(holes=8), False),
-    ],
-    ids=["boxes", "one inside out", "inside out", "open", "ball", "four holes", "eight holes"],
-)
-def test_a_solid_is_closed_apart_from_a_few_defects(mesh, is_solid):
-    assert MeshEdges(mesh, np.zeros(3), max_faces=10_000).is_solid == is_solid
-
-
-def test_a_solid_meets_in_a_hollow_at_its_inner_corner():
-    """The corner of an L, 1 high; nothing is hollow where the faces do not enclose it."""
-    outline = [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]
-    corners = [(x, y, z) for z in (0, 1) for x, y in outline]
-    lid = np.array([(0, 1, 3), (1, 2, 3), (0, 3, 5), (3, 4, 5)])
-    walls = [
-        face
-        for a, b in zip(range(6), [*range(1, 6), 0], strict=True)
-        for face in ((a, b, b + 6), (a, b + 6, a + 6))
-    ]
-    edges = edges_of(corners, [*lid[:, ::-1], *(lid + 6), *walls])
-    assert edges.is_solid
-    hollow = at(edges, (1.0, 1.0, 0.0), (1.0, 1.0, 1.0))
-    assert edges.is_concave.nonzero()[0].tolist() == [hollow]
-    assert not edges_of(corners, walls).is_concave.any()
-
-
 def test_simplification_keeps_the_number_of_faces_that_is_asked_for():
     sphere = trimesh.creation.icosphere(subdivisions=5)
     for most in (1000, 5000):

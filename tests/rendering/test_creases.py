@@ -144,21 +144,3 @@ def test_normals_of_a_smooth_surface_replace_those_of_edges_they_agree_with(
     )
     found = _Views._smoothed(views, places).normal[0, 0].tolist()
     assert np.degrees(np.arctan2(found[1], found[0])) == pytest.approx(expected, abs=1e-3)
-
-
-def test_a_solid_has_the_contours_of_its_faces():
-    """A dented ball, and the same faces with one in 300 turned over, which enclose nothing: of
-    them all edges are tried, also those that the ball hides itself."""
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.4)
-    ball.vertices *= 1.0 + 0.15 * np.sin(40.0 * ball.vertices).mean(axis=1, keepdims=True)
-    soup = ball.copy()
-    soup.faces[::300] = soup.faces[::300, ::-1]
-    of_solid = seen(ball)
-    of_faces = seen(soup)
-    for part in (slice(0, MAX_OCCLUDING), slice(MAX_OCCLUDING, None)):
-        points = of_solid.model[0, part][of_solid.valid[0, part]]
-        others = of_faces.model[0, part][of_faces.valid[0, part]]
-        assert len(points) > 0.9 * len(others) > 30
-        gap = torch.cdist(points, others).amin(dim=1)
-        # within four px; the places on the edges are not the same
-        assert (gap < 4 * PIXEL).double().mean() > 0.95
