@@ -235,10 +235,10 @@ def confidence_features(
     }
 
 
-def resolution(*, exact: bool) -> float:
-    """Difference of two scores up to which a photograph does not tell which of two poses is
-    right."""
-    return float(CALIBRATION[_model_name(exact=exact)]["resolution"])
+def resolution() -> float:
+    """Difference of two scores up to which a photograph does not tell which of two poses of an
+    exact mesh is right."""
+    return float(CALIBRATION["instance"]["resolution"])
 
 
 def shares(scores: Tensor, *, exact: bool) -> Tensor:

@@ -417,7 +417,7 @@ def compared_with_mirror_image(
     if not len(compared):
         return found
     gain = mirror_gain(target, block, crops, best[compared])
-    for place in compared[gain > resolution(exact=True)].tolist():
+    for place in compared[gain > resolution()].tolist():
         doubted = found[place].scaled(MIRROR_DOUBT)
         found[place] = replace(doubted, warnings=(*doubted.warnings, MIRROR_WARNING))
     return found
