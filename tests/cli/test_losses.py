@@ -7,7 +7,7 @@ import pytest
 from curvireg_torch.cli import main
 from curvireg_torch.formats.exports.ros import FILES
 from curvireg_torch.jobs.outputs import MARKER, output_folder
-from tests._support.lists import CAMERA, box_of, table, written
+from tests._support.lists import CAMERA, box_of, lines, table, written
 from tests._support.quick import slow_after
 from tests._support.scenes import scene, write_video
 
@@ -34,6 +34,12 @@ def test_sources_of_one_name_keep_their_own_results(folder, register, tmp_path, 
     frame = "" if first.endswith("png") else ":000000"
     assert [row["photo"] for row in rows] == [f"{source}{frame}" for source in sources]
     assert rows[0]["r11"] != rows[1]["r11"]
+    together = lines(tmp_path / "out")
+    for number, source in enumerate(sources if frame else []):  # one photograph is no list
+        assert register(source, *words, out=str(number)) == 0
+        (alone,) = lines(tmp_path / str(number))
+        for name in ("rotation", "score"):
+            assert alone[name] == together[number][name]
     assert register(*sources[::-1], *words) == 0
     assert [row["r11"] for row in table(tmp_path / "out")] == [row["r11"] for row in rows[::-1]]
 

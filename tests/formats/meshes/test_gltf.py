@@ -223,16 +223,20 @@ def test_a_texture_without_coordinates_or_format_is_named(tmp_path, load):
     assert "in a format that is not read" in load(tree.write(tmp_path / "a.gltf"))[1][0]
 
 
-def test_quantised_positions(tmp_path, load):
+def test_quantised_positions_and_places_of_nodes(tmp_path, load):
     tree = Tree()
     part = tree.part(BOX.faces)
     part["attributes"]["POSITION"] = tree.array(
         np.round(BOX.vertices * 2 * 1000), "h", normalized=True
     )
     tree.content["extensionsRequired"] = ["KHR_mesh_quantization"]
-    tree.content["nodes"] = [{"mesh": 0, "scale": [32.767 / 2] * 3}]
+    quarter = math.sqrt(0.5)
+    tree.content["nodes"] = [
+        {"children": [1], "translation": [10, 0, 0], "scale": [32.767 / 2] * 3},
+        {"mesh": 0, "rotation": [0, 0, quarter, quarter]},
+    ]
     mesh, _ = load(tree.write(tmp_path / "a.gltf"))
-    np.testing.assert_allclose(mesh.bounds, BOX.bounds, atol=1e-5)
+    np.testing.assert_allclose(mesh.bounds, [[9, -1.5, -0.5], [11, 1.5, 0.5]], atol=1e-5)
 
 
 def test_morph_targets_are_named(tmp_path, load):
