@@ -125,7 +125,7 @@ def at(*keys: str | int) -> Value:
 
     def value(record: dict[str, Any]) -> float:
         found = reduce(getitem, keys, record)
-        return math.nan if found is None else float(found)  # type: ignore[arg-type]
+        return math.nan if found is None else float(found)
 
     return value
 

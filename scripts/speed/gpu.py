@@ -30,23 +30,23 @@ TOGETHER = (1, 8, 64)  # photographs in one call
 Record = dict[str, Any]
 
 
-def seconds_of(function: Callable[[], object]) -> float:
+def seconds_of(function: Callable[[], object], device: str) -> float:
     """Of one call, until the device has finished."""
-    finish()
+    finish(device)
     start = time.perf_counter()
     function()
-    finish()
+    finish(device)
     return time.perf_counter() - start
 
 
-def finish() -> None:
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
+def finish(device: str) -> None:
+    if device != "cpu":
+        torch.cuda.synchronize(device)
 
 
-def rate(function: Callable[[], object], count: int) -> Record:
+def rate(function: Callable[[], object], count: int, device: str) -> Record:
     """Seconds of a call with ``count`` photographs."""
-    seconds = seconds_of(function)
+    seconds = seconds_of(function, device)
     return {"seconds": seconds, "photographs_per_second": count / seconds}
 
 
@@ -75,12 +75,12 @@ def measure(
         return cr.ViewBank.build(mesh, views, progress=False, device=device)
 
     bank = build()  # kernels are loaded
-    record("bank", {"seconds": seconds_of(build), "views": len(bank)})
+    record("bank", {"seconds": seconds_of(build, device), "views": len(bank)})
 
     matcher = ViewMatcher(bank)
     matcher(others.images, others.boxes)
     matcher(new.images, new.boxes)  # describes the views that it needs
-    record("rank", rate(lambda: matcher(new.images, new.boxes), count))
+    record("rank", rate(lambda: matcher(new.images, new.boxes), count, device))
 
     registrar = cr.Registrar(matcher)
 
@@ -88,11 +88,12 @@ def measure(
         return registrar(some.images[first:last], some.boxes[first:last], some.K)
 
     register(others, 0, count)
-    record("new", rate(lambda: register(new, 0, count), count))
+    record("new", rate(lambda: register(new, 0, count), count, device))
     for together in TOGETHER:
         number = min(together, count)
         register(new, 0, number)
-        record(f"register_{together}", rate(lambda n=number: register(new, 0, n), number))  # type: ignore[misc]
+        measured = rate(lambda n=number: register(new, 0, n), number, device)
+        record(f"register_{together}", measured)
     results = register(new, 0, count)
     errors = degrees(results, [pose[:3, :3] for pose in new.poses])
     within = {
@@ -112,12 +113,12 @@ def measure(
     boxes = torch.cat([new.boxes[:half], of_truck.boxes[half:]])
     found = two(images, boxes, new.K)
     right = [result.ok and result.mesh_index == (k >= half) for k, result in enumerate(found)]
-    measured = rate(lambda: two(images, boxes, new.K), count)
+    measured = rate(lambda: two(images, boxes, new.K), count, device)
     record("two_meshes", {**measured, "right_mesh": sum(right) / count})
 
     on_cpu = cr.Registrar(bank.to("cpu"))
     expected = on_cpu(new.images[:few], new.boxes[:few], new.K)
-    record("cpu", rate(lambda: on_cpu(new.images[:few], new.boxes[:few], new.K), few))
+    record("cpu", rate(lambda: on_cpu(new.images[:few], new.boxes[:few], new.K), few, "cpu"))
     errors = degrees(results[:few], rotations(expected))
     known = [error for error in errors if error is not None]
     record("degrees_from_cpu", {"each": errors, "median": statistics.median(known or [180.0])})
