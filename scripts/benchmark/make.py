@@ -81,6 +81,7 @@ class Packages:
         return [k + TWIN for k in self.ids] if self.cad in TWINS else self.ids
 
     def rng(self, purpose: int, obj_id: int) -> Rng:
+        """Random numbers of an object, others for each purpose."""
         return np.random.default_rng((self.seed, purpose, obj_id))
 
     @lru_cache(maxsize=100)  # noqa: B019 (lives as long as its process)
@@ -311,7 +312,7 @@ Annotated = dict[int, tuple[int, TexturedMesh]]
 def compose(
     objects: Packages, options: Namespace, index: int, attempt: int
 ) -> tuple[Scene, Annotated]:
-    """Scene ``index``."""
+    """Scene ``index``, a different one at each ``attempt``."""
     rng = np.random.default_rng((options.seed, index, attempt))
     if options.kind == "shelf":
         scene, annotated = full_shelf(objects, options, rng)

@@ -256,7 +256,10 @@ def car(rng: Rng) -> Parts:
         n = len(outline)
         ring = np.arange(n)
         following = (ring + 1) % n
-        ends = [np.stack([k + ring, k + following, np.full(n, 2 * n + k // n)], -1) for k in (0, n)]
+        ends = [
+            np.stack([side * n + ring, side * n + following, np.full(n, 2 * n + side)], -1)
+            for side in (0, 1)
+        ]
         vertices = np.concatenate([shell.vertices, sides.mean(axis=1)])
         return Surface(vertices, np.concatenate([shell.faces, *ends]))
 

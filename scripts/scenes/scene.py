@@ -129,9 +129,9 @@ def shelf(
     back = 3.0
     for z in sorted({round(float(shape.hull[:, 2].min()), 6) for shape in shapes}):
         board = [(x0, front, z), (x1, front, z), (x1, back, z), (x0, back, z)]
-        low = z - 0.12
-        edge_of_board = [(x0, front, low), (x1, front, low), (x1, front, z), (x0, front, z)]
-        shapes += [_quad(board, wood), _quad(edge_of_board, wood)]
+        under = z - 0.12
+        rim = [(x0, front, under), (x1, front, under), (x1, front, z), (x0, front, z)]
+        shapes += [_quad(board, wood), _quad(rim, wood)]
     wall = [(x0, back, -1), (x1, back, -1), (x1, back, top), (x0, back, top)]
     shapes.append(_quad(wall, Texture(textures(rng))))
     fill = rng.uniform(0.7, 1.0) * max(size)
