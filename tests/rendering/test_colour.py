@@ -2,11 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from PIL import Image
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
-from curvireg_torch.mesh import as_mesh
+from curvireg_torch.mesh import as_mesh, load_mesh
 from curvireg_torch.rendering import make_renderer, render_colour, shade
 from tests._support.numbers import double
 
@@ -108,6 +109,15 @@ def test_render_colour_is_grey_without_colours_or_faces():
     assert render_colour(mesh, T[:0], K, SIZE).shape == (0, 3, *SIZE)
     single = render_colour(bare, T, K, SIZE, supersampling=1)
     assert (single == shade(make_renderer(bare).render(T, K, SIZE), K)).all()
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj"])
+def test_a_print_is_read_as_it_was_exported(tmp_path, suffix):
+    box = textured_box()
+    box.export(tmp_path / f"box.{suffix}")
+    meshes = box, load_mesh(tmp_path / f"box.{suffix}")
+    expected, found = (render_colour(mesh, camera(20.0, 30.0), K, SIZE) for mesh in meshes)
+    torch.testing.assert_close(found, expected, rtol=0.0, atol=0.01)
 
 
 def test_colours_of_vertices_are_interpolated():

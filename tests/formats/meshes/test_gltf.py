@@ -118,6 +118,14 @@ def test_strips_have_all_their_faces_and_lines_none(tmp_path, load):
         )
 
 
+def test_values_may_lie_apart_behind_others(tmp_path, load):
+    tree = Tree()
+    tree.part(None, np.c_[[9.0] * 3, TRIANGLE])
+    tree.content["accessors"][0] |= {"type": "VEC3", "byteOffset": 4}
+    tree.content["bufferViews"][0]["byteStride"] = 16
+    assert load(tree.write(tmp_path / "a.gltf"))[0].vertices.tolist() == TRIANGLE
+
+
 def sparse(tree, index, values, kind="B"):
     """What an accessor says of ``values`` at places that differ from its own."""
     accessors = tree.content["accessors"]

@@ -86,14 +86,19 @@ def test_a_joint_moves_what_its_inverse_bind_matrix_has_moved(tmp_path):
 
 
 def test_joints_stand_in_the_frames_of_their_parents(tmp_path):
-    """The place of the node that has the skin does not count."""
+    """The place of the node that has the skin does not count; another node shows the mesh as it
+    is stored."""
     joints = [[0] * 4, [1] * 4, [1] * 4]
     nodes = {"translation": [0, 5, 0], "children": [2]}, {"translation": [3, 0, 0]}
-    tree = skinned(joints, [1, 0, 0, 0], *nodes)
+    binds = np.tile(np.eye(4), (2, 1, 1))
+    binds[1, 3, 0] = -1.0  # of a joint that stood at x = 1
+    tree = skinned(joints, [1, 0, 0, 0], *nodes, inverseBindMatrices=binds)
     tree.content["nodes"][0]["translation"] = [100, 0, 0]
-    tree.content["scenes"] = [{"nodes": [0, 1]}]
+    tree.content["nodes"].append({"mesh": 0})
+    tree.content["scenes"] = [{"nodes": [0, 1, 3]}]
     mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
-    np.testing.assert_allclose(mesh.vertices, [[0, 5, 0], [4, 5, 0], [3, 6, 0]], atol=1e-6)
+    expected = [[0, 5, 0], [3, 5, 0], [2, 6, 0], *TRIANGLE]
+    np.testing.assert_allclose(mesh.vertices, expected, atol=1e-6)
 
 
 def test_weights_of_joints_are_shares(tmp_path):
@@ -131,14 +136,23 @@ def test_specular_colours_win_over_metallic_ones(tmp_path):
     assert mesh.colours.textures == ()
 
 
-def test_a_part_without_a_texture_keeps_its_own_colour(tmp_path):
+def test_parts_keep_their_own_colours_and_textures(tmp_path):
+    """The second picture lies in a view, as in GLB."""
     tree = textured({})
-    tree.part(None, np.add(TRIANGLE, 5), material=1)
-    blue = {"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 1, 1]}}
-    tree.content["materials"].append(blue)
+    tree.content["materials"] += [
+        {"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 1, 1]}},
+        {"pbrMetallicRoughness": {"baseColorTexture": {"index": 1}}},
+    ]
+    tree.content["textures"] += [{"source": 1}]
+    for material in (1, 2, None):
+        part = tree.part(None, TRIANGLE, **({} if material is None else {"material": material}))
+        part["attributes"]["TEXCOORD_0"] = 1
+    tree.array(np.frombuffer(painted((0, 255, 0)), np.uint8), "B")
+    tree.content["images"] += [{"bufferView": len(tree.content["bufferViews"]) - 1}]
     mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
-    assert mesh.colours.texture.tolist() == [0, -1]
-    assert first_corners(mesh) == [RED, BLUE]
+    assert mesh.colours.texture.tolist() == [0, -1, 1, -1]
+    assert textures(mesh) == [WHITE, WHITE, GREEN, WHITE]
+    assert first_corners(mesh) == [RED, BLUE, WHITE, WHITE]
 
 
 def test_a_picture_as_webp_wins(tmp_path):
@@ -481,11 +495,12 @@ def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path, load):
 
 
 def test_colours_of_a_material_in_memory():
-    """Of one that states none, trimesh makes a grey, which is no colour of the mesh."""
+    """Of one that states none, trimesh makes a grey, which is no colour of the mesh. Factors of
+    glTF are linear: 51 is 124 of sRGB."""
     for material, expected in (
         (trimesh.visual.material.SimpleMaterial(diffuse=[10, 20, 30, 255]), [10, 20, 30]),
         (trimesh.visual.material.SimpleMaterial(), None),
-        (trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 0, 255]), RED),
+        (trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 51, 0, 255]), [255, 124, 0]),
     ):
         mesh = trimesh.Trimesh(TRIANGLE, [[0, 1, 2]], process=False)
         mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((3, 2)), material=material)
