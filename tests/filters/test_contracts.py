@@ -11,7 +11,7 @@ from torch._dynamo.testing import CompileCounter
 
 from curvireg_torch import filters
 
-from .._support.layer_contract import LayerContract
+from .._support.layer_contract import SIZE, LayerContract, tensors
 from .layer_cases import LAYERS, PAIRS, depths, equal_up_to_sign, photos
 
 
@@ -24,6 +24,12 @@ class TestLayers(LayerContract):
         return (
             case(x).norm(dim=1, keepdim=True) < 1.0 - 1e-6 if case.name.startswith("mcs") else 1.0
         )
+
+    def test_autocast_changes_nothing(self, case):
+        x = case.inputs(2, SIZE)
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            found = tensors(case(x))
+        torch.testing.assert_close(found, tensors(case(x)), rtol=0.0, atol=0.0)
 
 
 @pytest.mark.parametrize(

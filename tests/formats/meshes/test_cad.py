@@ -86,10 +86,9 @@ def test_step_files_are_bounded_in_size_and_time(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("suffix", "package", "extra"),
     [
-        ("step", "cascadio", "cad"),
-        ("igs", "cascadio", "cad"),
+        *((suffix, "cascadio", "cad") for suffix in ("step", "stp", "iges", "igs")),
         ("dae", "collada", "cad"),
-        ("usdz", "pxr", "usd"),
+        *((suffix, "pxr", "usd") for suffix in ("usd", "usda", "usdc", "usdz")),
     ],
 )
 def test_the_message_names_the_extra(write, monkeypatch, suffix, package, extra):
