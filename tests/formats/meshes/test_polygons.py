@@ -35,7 +35,7 @@ def test_divide_faces_covers_polygons_once(axis, sign):
         # A plane over (u, v) of slope (0.3, 0.3): area grows by sqrt(1.18). Equal sums mean that
         # none overlap.
         a, b, c = np.moveaxis(
-            polygon[np.array(divide_faces(polygon, [list(range(len(polygon)))])[0])], 1, 0
+            polygon[np.array(divide_faces(polygon, [[0, 1, 2], [*range(len(polygon))]])[1])], 1, 0
         )
         (x, y), area = flat.T, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum()
         expected = 0.5 * abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()))
