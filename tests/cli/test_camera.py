@@ -191,11 +191,16 @@ def test_strict_tells_by_the_exit_code_whether_what_is_needed_is_reliable(
         assert register_one(*words, "--strict", *need) == code
     with pytest.raises(SystemExit):  # without --strict
         register_one(*words, "--need", "axis")
-    row = [folder / "photos" / "0.png", *box_of(0), *CAMERA]
-    listed = written(tmp_path / "list.csv", "photo,x0,y0,x1,y1,fx,fy,cx,cy", row)
-    verdicts.append("reliable axis")
+    listed = tmp_path / "list.csv"
     words = ["--list", listed, folder / "truck.safetensors", "--strict", "--need", "axis"]
-    assert register(*words, out="listed") == 0
+    for verdict, names, code in (
+        ("reliable axis", ["0.png"], 0),
+        ("unsure", ["0.png", "none.png"], NONE_RELIABLE),
+    ):
+        rows = [[folder / "photos" / name, *box_of(0), *CAMERA] for name in names]
+        written(listed, "photo,x0,y0,x1,y1,fx,fy,cx,cy", *rows)
+        verdicts.append(verdict)
+        assert register(*words, out=verdict) == code
 
 
 def test_the_command_line_names_the_options_that_help(folder, register_one, refused):

@@ -184,7 +184,9 @@ def test_register_files_folders_and_patterns(folder, register, document, refused
     assert register(photos / "2.png", photos, photos / "[01].png", folder / "none.png", *bank) == 0
     rows = table(tmp_path / "out")
     assert list(rows[0])[:9] == ["photo", "x0", "y0", "x1", "y1", "fx", "fy", "cx", "cy"]
-    assert lines(tmp_path / "out")[1]["inputs"]["box"] == [float(v) for v in box_of(0)]
+    inputs = lines(tmp_path / "out")[1]["inputs"]
+    assert inputs["box"] == [float(v) for v in box_of(0)]
+    assert inputs["camera"] == [float(v) for v in CAMERA]
     names = ["2.png", "0.png", "1.png", "2.png", "0.png", "1.png"]
     files = [*(photos / name for name in names), folder / "none.png"]
     assert [row["photo"] for row in rows] == [*map(str, files)]

@@ -10,7 +10,9 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from curvireg_torch import Registration
 from curvireg_torch.cli import main
+from curvireg_torch.cli.register import NONE_RELIABLE
 from curvireg_torch.jobs.rigs import read_rig
 from tests._support.lists import (
     check_pose,
@@ -38,10 +40,11 @@ def register(folder, rig, out, *words):
     return main(["register", *files, "--quiet", *words])
 
 
-def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, capsys):
+def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, monkeypatch, capsys):
     place, rows = rig
+    monkeypatch.setattr(Registration, "verdict", "unsure")
     path = written(place / "rig.csv", HEADER, *rows, ["none.png", *rows[0][1:]])
-    assert register(folder, path, tmp_path, "--format", "ros") == 0
+    assert register(folder, path, tmp_path, "--format", "ros", "--strict") == NONE_RELIABLE
     document = json.loads((tmp_path / "result.json").read_text())
     check_pose(document, WORLD, 1.5, SHARE)
     assert (document["frame"], document["T_cam_from_model"]) == ("world", None)
