@@ -56,5 +56,5 @@ plt.show()
 
 # %%
 # One peak: the photograph determines the pose. Two peaks: both poses are reported as hypotheses. A
-# ridge: the rotation about the axis is undetermined. :doc:`/guides/ambiguous` shows how to declare
+# ridge: the rotation about the axis is undetermined. :doc:`/guides/how-sure` shows how to declare
 # a symmetry.

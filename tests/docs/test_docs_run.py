@@ -43,7 +43,7 @@ AZIMUTHS = {"photo.jpg": 30.0, "front.jpg": 210.0, "left.jpg": 300.0, "above.jpg
 FIRST_PAGES = (ROOT / "README.md", DOCS / "getting-started.md")
 SLOW = {
     *("evaluation", "datasets", "several", "coming-from", "boxes", "without-a-box", "unit-and-up"),
-    *("layers", "ambiguous", "photographs", "several-photographs", "known-pose", "cameras"),
+    *("layers", "how-sure", "photographs", "several-photographs", "known-pose", "cameras"),
     *("follow", "pose-prior", "many", "results"),
 }  # the others run some seconds
 
