@@ -22,9 +22,10 @@ from ..geometry.viewpoint import up_rotation
 from ..matching import cached_bank
 from ..mesh import Mesh, mesh_centre
 from ..registration import Registrar, Registration
+from ..registration.stages import share_of_worker
 from ..synthetic import synthesize_photograph
 from ..utils.aliases import Fields
-from ..utils.threads import map_on_threads
+from ..utils.threads import available_threads, map_on_threads
 from .photographs import (
     SIZE,
     GeneratedPhotograph,
@@ -45,7 +46,8 @@ IDENTITY = torch.eye(3, dtype=torch.float64)[None]
 Report: TypeAlias = Callable[[str, int, int], object]
 """Is called with a stage, done and total."""
 
-Register: TypeAlias = Callable[[Any], "Outcome"]
+Register: TypeAlias = Callable[[Sequence[Any]], list["Outcome"]]
+"""The outcomes of a batch: of photographs, or of their numbers."""
 
 
 def report_nothing(stage: str, done: int, total: int) -> None:
@@ -145,7 +147,7 @@ def run_trial(
     compare: bool = True,
     report: Report = report_nothing,
 ) -> Trial:
-    """Register photographs 0 to ``count - 1`` of the registrar's mesh, several at a time, and a
+    """Register photographs 0 to ``count - 1`` of the registrar's mesh, in batches, and a
     fifth of them without a camera, with a hint, with a second photograph, and without the mesh's
     colours or with a print.
 
@@ -171,17 +173,21 @@ def run_trial(
     lock = threading.Lock()
 
     def results(register: Register, items: Sequence[Any]) -> list[Outcome]:
-        def job(item: Any) -> Outcome:
-            outcome = register(item)
+        def job(batch: Sequence[Any]) -> list[Outcome]:
+            outcomes = register(batch)
             with lock:
-                report("photographs", next(counter), total)
-            return outcome
+                for _ in batch:
+                    report("photographs", next(counter), total)
+            return outcomes
 
-        return map_on_threads(job, items, device=registrar.bank.device)
+        size = share_of_worker(len(items), available_threads())
+        batches = [items[k : k + size] for k in range(0, len(items), size)]
+        of_batches = map_on_threads(job, batches, device=registrar.bank.device)
+        return list(itertools.chain.from_iterable(of_batches))
 
     report("photographs", 0, total)
     registrar.share()
-    outcomes = results(lambda number: setup.register(generate(number)), range(count))
+    outcomes = results(lambda numbers: setup.register(list(map(generate, numbers))), range(count))
     some = outcomes[:part]
     photographs = [outcome.photograph for outcome in some]
     compared = {}
@@ -194,8 +200,8 @@ def run_trial(
 
 @dataclass(frozen=True)
 class _Condition:
-    """Another condition, and how a photograph is registered under it, and without it where that is
-    not how it was registered."""
+    """Another condition, and how photographs are registered under it, and without it where that is
+    not how they were registered."""
 
     name: str
     after: Register
@@ -216,22 +222,32 @@ class _Setup:
         return self.registrar.bank.mesh
 
     def register(
-        self, photograph: GeneratedPhotograph, *, prior: PosePrior | None = None
-    ) -> Outcome:
-        camera = photograph.camera if self.with_camera else None
-        found = self.registrar([photograph.image], photograph.box[None], camera, prior=prior)[0]
-        return self.outcome(photograph, found if isinstance(found, Registration) else None)
+        self,
+        photographs: Sequence[GeneratedPhotograph],
+        *,
+        prior: Sequence[PosePrior] | None = None,
+    ) -> list[Outcome]:
+        images = [photograph.image for photograph in photographs]
+        boxes = torch.stack([photograph.box for photograph in photographs])
+        cameras = torch.stack([photograph.camera for photograph in photographs])
+        found = self.registrar(images, boxes, cameras if self.with_camera else None, prior=prior)
+        return [
+            self.outcome(photograph, result if isinstance(result, Registration) else None)
+            for photograph, result in zip(photographs, found, strict=True)
+        ]
 
-    def register_with_hint(self, photograph: GeneratedPhotograph) -> Outcome:
-        """The outcome with a pose that a user has set by hand, some degrees off."""
-        generator = _generator(photograph)
-        axis = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
-        angle = math.radians(HINT_ERROR) * float(torch.rand((), generator=generator))
-        rotation = rotation_from_axis_angle(angle * axis) @ photograph.truth[:3, :3]
-        return self.register(photograph, prior=PosePrior(rotation=rotation, within=HINT_DEGREES))
+    def register_with_hints(self, photographs: Sequence[GeneratedPhotograph]) -> list[Outcome]:
+        """The outcomes with poses that a user has set by hand, some degrees off."""
+        return self.register(photographs, prior=list(map(_hint, photographs)))
 
-    def register_with_second(self, photograph: GeneratedPhotograph, subject: Mesh) -> Outcome:
-        """The outcome of a photograph and a second one of the ``subject``, from beside it."""
+    def register_with_second(
+        self, photographs: Sequence[GeneratedPhotograph], subject: Mesh
+    ) -> list[Outcome]:
+        """The outcomes of photographs, each with a second one of the ``subject``, from beside
+        it."""
+        return [self._with_second(photograph, subject) for photograph in photographs]
+
+    def _with_second(self, photograph: GeneratedPhotograph, subject: Mesh) -> Outcome:
         K = photograph.camera
         turn = rotation_from_axis_angle(
             torch.tensor([0.0, math.radians(SECOND_CAMERA), 0.0], dtype=torch.float64)
@@ -274,7 +290,7 @@ def _conditions(setup: _Setup, generate: PhotographGenerator, report: Report) ->
     other = replace(setup, with_camera=not is_known)
     conditions = [
         _Condition("without a camera" if is_known else "with a camera", other.register),
-        _Condition(f"with a pose prior within {HINT_DEGREES:g} degrees", setup.register_with_hint),
+        _Condition(f"with a pose prior within {HINT_DEGREES:g} degrees", setup.register_with_hints),
         _Condition(
             "with a second photograph from another side",
             partial(setup.register_with_second, subject=generate.subject),
@@ -294,8 +310,8 @@ def _conditions(setup: _Setup, generate: PhotographGenerator, report: Report) ->
         *conditions,
         _Condition(
             name,
-            lambda photograph: by_print.register(print_seen(photograph.number)),
-            lambda photograph: by_shape.register(print_seen(photograph.number)),
+            lambda photographs: by_print.register([print_seen(one.number) for one in photographs]),
+            lambda photographs: by_shape.register([print_seen(one.number) for one in photographs]),
         ),
     ]
 
@@ -317,6 +333,15 @@ def _like(registrar: Registrar, mesh: Mesh, report: Report) -> Registrar:
 def _viewpoint_of(mesh: Mesh, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Azimuth, elevation and theta of rotations (..., 3, 3) from the mesh's axes, z up."""
     return viewpoint_from_rotation(rotation @ up_rotation(mesh.up).double().mT)
+
+
+def _hint(photograph: GeneratedPhotograph) -> PosePrior:
+    """A pose that a user has set by hand, some degrees off."""
+    generator = _generator(photograph)
+    axis = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+    angle = math.radians(HINT_ERROR) * float(torch.rand((), generator=generator))
+    rotation = rotation_from_axis_angle(angle * axis) @ photograph.truth[:3, :3]
+    return PosePrior(rotation=rotation, within=HINT_DEGREES)
 
 
 def _generator(photograph: GeneratedPhotograph) -> torch.Generator:
