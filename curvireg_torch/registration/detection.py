@@ -5,8 +5,9 @@ its features. The boxes that they propose are compared with all views, and the m
 are registered.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -17,19 +18,20 @@ from ..geometry.crops import box_iou, non_maximum_suppression
 from ..geometry.framing import boxes_at
 from ..geometry.pose_prior import PosePrior
 from ..matching.detector import SAME_OBJECT_OVERLAP, Proposals
-from ..terms import QueryFeatures
 from ..utils.likes import CameraLike, ImagesLike
+from ..utils.precision import exact_convolutions
 from .block import keypoint_poses
 from .camera import limits_of, usual_camera
 from .confidence import detection_probability, two_decimals
 from .hypotheses import projected_box
 from .photograph import Photograph, as_photographs, check_crop
 from .result import Detection, FailedRegistration, Registration, Results
-from .stages import map_photographs, register
+from .stages import allowed_views, blocks_of, failure, register_boxes
 from .target import Target
 
 MIN_REGISTERED = 2  # Places that are registered at least, as a fitted pose tells more than its box
 FOUND_CONFIDENCE = 0.1  # Confidence below which the object counts as not found
+SCORED_AT_A_TIME = 64  # Boxes whose crops are in memory together
 
 
 @torch.no_grad()
@@ -80,24 +82,46 @@ def detect_prepared(
     """:func:`detect` in photographs that :func:`.as_photographs` has prepared."""
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
-    found = map_photographs(
-        items, lambda item, index: detect_one(target, item, index, instances=instances)
-    )
-    return [[one] if isinstance(one, FailedRegistration) else one for one in found]
+    found: list[Results] = []
+    with exact_convolutions():
+        for first, some in blocks_of(items, target.bank.device.type):
+            found += detect_block(target, some, first, instances=instances)
+    return found
 
 
-def detect_one(target: Target, item: Photograph, index: int, *, instances: int = 1) -> Results:
-    """:func:`detect` in one photograph, the ``index``-th one; its box does not matter."""
-    target.report_progress("detection")
-    proposals = propose(target, item)
-    candidates = _register_candidates(target, item, proposals, instances)
-    found = _with_proposals(candidates, proposals)
-    convincing = [
-        one
-        for one in found
-        if (1.0 if one.confidence is None else one.confidence) >= FOUND_CONFIDENCE
-    ]
-    return [*convincing] or [_lost(found, index)]
+def detect_block(
+    target: Target,
+    items: Sequence[Photograph | CurviregError],
+    first: int,
+    *,
+    instances: int = 1,
+) -> list[Results]:
+    """:func:`detect` in a few photographs, whose boxes do not matter; the ``first`` one's index is
+    that of the caller."""
+    errors = {p: item for p, item in enumerate(items) if isinstance(item, CurviregError)}
+    results: dict[int, Results] = {p: [FailedRegistration(one)] for p, one in errors.items()}
+    photographs = {p: item for p, item in enumerate(items) if isinstance(item, Photograph)}
+    proposals: dict[int, Proposals] = {}
+    found: dict[int, list[RegisteredBox] | CurviregError] = {}
+    for p, item in photographs.items():
+        target.report_progress("detection")
+        try:
+            proposals[p] = propose(target, item)
+        except CurviregError as error:
+            found[p] = error
+    found |= _register_candidates(target, photographs, proposals, instances)
+    for p, candidates in found.items():
+        if isinstance(candidates, CurviregError):
+            results[p] = [failure(candidates, first + p)]
+            continue
+        registered = _with_proposals(candidates, proposals[p])
+        convincing = [
+            one
+            for one in registered
+            if (1.0 if one.confidence is None else one.confidence) >= FOUND_CONFIDENCE
+        ]
+        results[p] = [*convincing] or [_lost(registered, first + p)]
+    return [results[p] for p in range(len(items))]
 
 
 def propose(target: Target, item: Photograph) -> "Proposals":
@@ -162,42 +186,19 @@ def _allowed_views(target: Target, item: Photograph) -> Tensor:
 
 
 @dataclass(frozen=True)
-class DescribedBox:
-    """A described box (4,) of a photograph, with its ``response`` and ``rival``
+class ScoredBox:
+    """A box (4,) of the ``photograph``-th photograph, with its ``response`` and ``rival``
     (:func:`detection_probability`), and as ``score`` the probability that it shows the object."""
 
+    photograph: int
     box: Tensor
     response: float
     rival: float | None
-    query: QueryFeatures
-    score: float
-
-    @classmethod
-    def compared(
-        cls,
-        target: Target,
-        item: Photograph,
-        box: Tensor,
-        response: float,
-        rival: float | None,
-    ) -> "DescribedBox":
-        """Compare a box (4,) with all views."""
-        query = target.matcher.query([item.image], box[None].float())
-        allowed = None
-        if item.prior is not None:
-            allowed = limits_of(target, replace(item, box=box.float())).allowed()[None]
-        similarity = float(target.matcher.similarity(query, allowed))
-        score = detection_probability(response, similarity, rival=rival)
-        return cls(box, response, rival, query, score)
-
-    def register(self, target: Target, item: Photograph) -> "RegisteredBox":
-        (result,) = register(target, [replace(item, box=self.box.float())], self.query)
-        box = projected_box(target.describer, result.projection)
-        return RegisteredBox(**{**vars(self), "box": box}, registration=result)
+    score: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegisteredBox(DescribedBox):
+class RegisteredBox(ScoredBox):
     """One that was registered; its ``box`` (4,) is that around the pose."""
 
     registration: Registration
@@ -211,40 +212,126 @@ class RegisteredBox(DescribedBox):
 
 
 def _register_candidates(
-    target: Target, item: Photograph, proposals: Proposals, instances: int
-) -> list[RegisteredBox]:
-    """The most probable objects, at most ``instances``, whose boxes do not overlap; the error of
-    the best if there is none."""
-    candidates = []
-    failed = None
+    target: Target,
+    photographs: Mapping[int, Photograph],
+    proposals: Mapping[int, Proposals],
+    instances: int,
+) -> dict[int, list[RegisteredBox] | CurviregError]:
+    """For each photograph with proposals the most probable objects, at most ``instances``, whose
+    boxes do not overlap; the error of the best if there is none."""
+    boxes = [box for p, one in proposals.items() for box in _boxes_of(p, one)]
+    of_photographs: dict[int, list[ScoredBox]] = {p: [] for p in proposals}
+    errors: dict[int, CurviregError] = {}
+    for box, one in zip(boxes, _scored(target, photographs, boxes), strict=True):
+        if isinstance(one, ScoredBox):
+            of_photographs[box.photograph].append(one)
+        else:  # such as limits on the pose that leave no view in a box
+            errors.setdefault(box.photograph, one)
+    waiting = {p: _best_apart(some) for p, some in of_photographs.items()}
+    found: dict[int, list[RegisteredBox]] = {p: [] for p in proposals}
+    wanted = max(instances, MIN_REGISTERED)
+    while chosen := [box for p, some in waiting.items() for box in some[: wanted - len(found[p])]]:
+        for p in waiting:
+            waiting[p] = waiting[p][wanted - len(found[p]) :]
+        registered = _registered(target, photographs, chosen)
+        good = [one for one in registered if isinstance(one, RegisteredBox)]
+        for box, one in zip(chosen, registered, strict=True):
+            if isinstance(one, CurviregError):
+                errors.setdefault(box.photograph, one)
+        for one in _refined(target, photographs, good):
+            _add(found[one.photograph], one)
+    best_first = {
+        p: sorted(some, key=lambda one: one.probability, reverse=True)[:instances]
+        for p, some in found.items()
+    }
+    return {p: some or errors[p] for p, some in best_first.items()}
+
+
+def _boxes_of(photograph: int, proposals: Proposals) -> list[ScoredBox]:
+    """The proposals of a photograph, not yet scored."""
     counts = proposals.responses[: proposals.by_keypoints].tolist()
+    boxes = []
     for k, (box, response) in enumerate(
         zip(proposals.boxes, proposals.responses.tolist(), strict=True)
     ):
         rival = max([0.0, *counts[:k], *counts[k + 1 :]]) if k < len(counts) else None
+        boxes.append(ScoredBox(photograph, box, response, rival))
+    return boxes
+
+
+def _best_apart(boxes: Sequence[ScoredBox]) -> list[ScoredBox]:
+    """The boxes, best first, that do not overlap a better one."""
+    if not boxes:
+        return []
+    scores = torch.tensor([one.score for one in boxes])
+    where = torch.stack([one.box for one in boxes])
+    kept = non_maximum_suppression(where, scores, SAME_OBJECT_OVERLAP)
+    return [boxes[k] for k in kept.tolist()]
+
+
+Scored = TypeVar("Scored", bound=ScoredBox)
+
+
+def _scored(
+    target: Target,
+    photographs: Mapping[int, Photograph],
+    boxes: Sequence[Scored],
+    at_a_time: int = SCORED_AT_A_TIME,
+) -> list[Scored | CurviregError]:
+    """Boxes with their scores: all views are compared with each. Where that fails of some together,
+    each is scored alone."""
+    found: list[Scored | CurviregError] = []
+    for k in range(0, len(boxes), at_a_time):
+        some = boxes[k : k + at_a_time]
+        items = [replace(photographs[one.photograph], box=one.box.float()) for one in some]
         try:
-            candidates.append(DescribedBox.compared(target, item, box, response, rival))
-        except CurviregError as error:  # such as limits on the pose that leave no view here
-            failed = failed or error
-    if not candidates and failed is not None:
-        raise failed
-    boxes = torch.stack([c.box for c in candidates])
-    scores = torch.tensor([c.score for c in candidates])
-    found: list[RegisteredBox] = []
-    for k in non_maximum_suppression(boxes, scores, SAME_OBJECT_OVERLAP).tolist():
-        if len(found) < max(instances, MIN_REGISTERED):
-            _add(found, _refined(target, item, candidates[k].register(target, item)))
-    return sorted(found, key=lambda one: one.probability, reverse=True)[:instances]
+            limits = [None if item.prior is None else limits_of(target, item) for item in items]
+            images = [item.image for item in items]
+            query = target.matcher.query(images, torch.stack([item.box for item in items]))
+            similarities = target.matcher.similarity(query, allowed_views(target, limits)).tolist()
+        except CurviregError as error:
+            alone = at_a_time == 1
+            found += [error] if alone else _scored(target, photographs, some, at_a_time=1)
+            continue
+        for one, similarity in zip(some, similarities, strict=True):
+            probability = detection_probability(one.response, similarity, rival=one.rival)
+            found.append(replace(one, score=probability))
+    return found
 
 
-def _refined(target: Target, item: Photograph, found: RegisteredBox) -> RegisteredBox:
-    """The more certain one of a registration and of that of the box around its pose."""
-    try:
-        candidate = DescribedBox.compared(target, item, found.box, found.response, found.rival)
-    # the projected mesh lies outside the photograph: nothing there supports the pose
-    except InvalidInputError:
-        return replace(found, score=0.0)
-    return found if candidate.score <= found.score else candidate.register(target, item)
+def _registered(
+    target: Target, photographs: Mapping[int, Photograph], boxes: Sequence[ScoredBox]
+) -> list[RegisteredBox | CurviregError]:
+    """The registrations in boxes, with the boxes around their poses."""
+    items = [replace(photographs[one.photograph], box=one.box.float()) for one in boxes]
+    found: list[RegisteredBox | CurviregError] = []
+    for first, some in blocks_of(items, target.bank.device.type):
+        results = register_boxes(target, some)
+        for one, result in zip(boxes[first:], results, strict=False):
+            if isinstance(result, CurviregError):
+                found.append(result)
+                continue
+            box = projected_box(target.describer, result.projection)
+            found.append(RegisteredBox(**{**vars(one), "box": box, "registration": result}))
+    return found
+
+
+def _refined(
+    target: Target, photographs: Mapping[int, Photograph], found: Sequence[RegisteredBox]
+) -> list[RegisteredBox]:
+    """The more certain ones of registrations and of those of the boxes around their poses."""
+    best = list(found)
+    again: dict[int, RegisteredBox] = {}
+    for k, candidate in enumerate(_scored(target, photographs, found)):
+        if isinstance(candidate, CurviregError):
+            # the projected mesh lies outside the photograph: nothing there supports the pose
+            best[k] = replace(found[k], score=0.0)
+        elif candidate.score > found[k].score:
+            again[k] = candidate
+    for k, other in zip(again, _registered(target, photographs, list(again.values())), strict=True):
+        if isinstance(other, RegisteredBox):
+            best[k] = other
+    return best
 
 
 def _add(found: list[RegisteredBox], new: RegisteredBox) -> None:

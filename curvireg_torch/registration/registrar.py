@@ -20,13 +20,12 @@ from ..utils.choices import MESH_KINDS
 from ..utils.executors import Workers
 from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike, MeshLike
 from ..utils.precision import in_full_precision
-from .detection import detect_one
-from .judging import best_of_meshes
+from .detection import detect_block
 from .photograph import OnDemand, Photograph, as_photographs
 from .refinement import refine
 from .result import FailedRegistration, Registration, Results
 from .several import register_views
-from .stages import map_photographs, register_photographs, share_of_worker
+from .stages import register_block, register_photographs, share_of_worker
 from .target import Target
 
 __all__ = ["Registrar"]
@@ -202,25 +201,8 @@ class Registrar(Target):
         """
         if self.workers is not None and len(items) > 1:
             return _register_by_workers(self, self.workers, items, detects=detects)
-        if not detects:
-            return register_photographs(self, items, self.others)
-
-        meshes = (self, *self.others)
-
-        def detected(item: Photograph, index: int) -> Registration | FailedRegistration:
-            found = [mesh._detected(item, index) for mesh in meshes]
-            return best_of_meshes(found, meshes, item)
-
-        found: Results = map_photographs(items, detected)
-        return found
-
-    def _detected(self, item: Photograph, index: int) -> Registration | FailedRegistration:
-        """The registration of a photograph without a box to this mesh alone, or why there is
-        none."""
-        try:
-            return detect_one(self, item, index)[0]
-        except CurviregError as error:
-            return FailedRegistration(error.with_subject("").of_image(index))
+        in_block = _detected if detects else register_block
+        return register_photographs(self, items, self.others, in_block=in_block)
 
     def of_mesh(self, mesh_index: int) -> "Registrar":
         """Return the registrar of one of several meshes, by :attr:`Registration.mesh_index`."""
@@ -243,6 +225,11 @@ class Registrar(Target):
         """Register photographs of one object together, see
         :func:`curvireg_torch.registration.register_views`."""
         return register_views(self, images, boxes, camera_matrices, T_cam_from_world)
+
+
+def _detected(target: Target, items: Sequence[Photograph | CurviregError], first: int) -> Results:
+    """The most probable object in each of a few photographs."""
+    return [found[0] for found in detect_block(target, items, first)]
 
 
 def _matcher_of(

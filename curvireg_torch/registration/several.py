@@ -128,7 +128,7 @@ def _registered_to(
     if given := {i: item for i, item in photographs.items() if item.has_box}:
         found |= _registered(target, given, cameras)
     else:
-        detected = {i: _detected(target, item, i, cameras[i]) for i, item in photographs.items()}
+        detected = _detected(target, photographs, cameras)
         # they tell where it is in the others
         is_found = any(isinstance(one, RigPhotograph) for one in detected.values())
         for i, one in detected.items():
@@ -141,16 +141,19 @@ def _registered_to(
     return _registration(target, found, cameras, count)
 
 
-def _detected(
-    target: Target, item: Photograph, index: int, camera: Tensor
-) -> RigPhotograph | CurviregError:
-    """A photograph in which the object was searched for, or why it was not found."""
-    ((result,),) = detect_prepared(target, [item])
-    if isinstance(result, FailedRegistration):
-        return result.error.with_subject("").of_image(index)
-    assert result.detection is not None
-    item = replace(item, box=result.detection.box.float())
-    return RigPhotograph.of(target, item, result, index, camera)
+def _detected(target: Target, items: Mapping[int, Photograph], cameras: Tensor) -> RigPhotographs:
+    """Photographs, by their index, in which the object was searched for, or why it was not
+    found."""
+    found: RigPhotographs = {}
+    results = detect_prepared(target, list(items.values()))
+    for (i, item), (result,) in zip(items.items(), results, strict=True):
+        if isinstance(result, FailedRegistration):
+            found[i] = result.error.with_subject("").of_image(i)
+            continue
+        assert result.detection is not None
+        item = replace(item, box=result.detection.box.float())
+        found[i] = RigPhotograph.of(target, item, result, i, cameras[i])
+    return found
 
 
 def _registered(

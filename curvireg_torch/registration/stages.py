@@ -1,7 +1,7 @@
 """A registration, stage by stage, each for a block of photographs at once: describe, rank, start,
 screen, fit, refit, judge."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -52,6 +52,7 @@ from .photograph import Photograph, check_crop
 from .result import FailedRegistration, Registration, Results
 from .target import Target
 
+Items = Sequence[Photograph | CurviregError]
 Result = Registration | CurviregError
 
 BLOCK = {"cpu": 16}
@@ -78,46 +79,49 @@ def share_of_worker(photographs: int, workers: int, device: str = "cpu") -> int:
     return max(1, min(_block_size(device), photographs // (2 * workers)))
 
 
-def register_photographs(
-    target: Target,
-    items: Sequence[Photograph | CurviregError],
-    others: Sequence[Target] = (),
-) -> Results:
-    """Register photographs with boxes, in blocks, each to the best of the target and ``others``;
-    one that cannot be registered fails alone. Items are read on demand, so that few are in
-    memory."""
-    size = _block_size(target.bank.device.type)
-    results: Results = []
-    meshes = (target, *others)
-    with exact_convolutions():
-        for first in range(0, len(items), size):
-            some = [items[k] for k in range(first, min(first + size, len(items)))]
-            of_meshes = [_register_block(mesh, some, first) for mesh in meshes]
-            for item, found in zip(some, zip(*of_meshes, strict=True), strict=True):
-                given = item if isinstance(item, Photograph) else None
-                results.append(best_of_meshes(found, meshes, given))
-    return results
+def blocks_of(items: Items, device: str) -> Iterator[tuple[int, Items]]:
+    """Blocks of photographs on a kind of device, each with the index of its first one. Items are
+    read on demand, so that few are in memory."""
+    size = _block_size(device)
+    for first in range(0, len(items), size):
+        yield first, [items[k] for k in range(first, min(first + size, len(items)))]
 
 
-def _register_block(
-    target: Target, items: Sequence[Photograph | CurviregError], first: int
-) -> Results:
-    """Register a few photographs; the ``first`` one's index is that of the caller."""
+def register_block(target: Target, items: Items, first: int) -> Results:
+    """Register a few photographs with boxes; the ``first`` one's index is that of the caller."""
     results: Results = []
     registered = _with_corrected_boxes(target, items, register_boxes(target, items))
     for index, (item, result) in enumerate(zip(items, registered, strict=True), first):
         if isinstance(item, CurviregError):
             results.append(FailedRegistration(item))
         elif isinstance(result, CurviregError):
-            results.append(_failure(result, index))
+            results.append(failure(result, index))
         else:
             results.append(result)
     return results
 
 
-def map_photographs(
-    items: Sequence[Photograph | CurviregError], function: Callable[[Photograph, int], Any]
-) -> list[Any]:
+def register_photographs(
+    target: Target,
+    items: Items,
+    others: Sequence[Target] = (),
+    *,
+    in_block: Callable[[Target, Items, int], Results] = register_block,
+) -> Results:
+    """Register photographs in blocks, by default in their boxes, each to the best of the target and
+    ``others``; one that cannot be registered fails alone."""
+    results: Results = []
+    meshes = (target, *others)
+    with exact_convolutions():
+        for first, some in blocks_of(items, target.bank.device.type):
+            of_meshes = [in_block(mesh, some, first) for mesh in meshes]
+            for item, found in zip(some, zip(*of_meshes, strict=True), strict=True):
+                given = item if isinstance(item, Photograph) else None
+                results.append(best_of_meshes(found, meshes, given))
+    return results
+
+
+def map_photographs(items: Items, function: Callable[[Photograph, int], Any]) -> list[Any]:
     """Results of ``function(item, index)`` for photographs one by one, a
     :class:`FailedRegistration` for each error. Items are read on demand, so that few are in
     memory."""
@@ -131,17 +135,15 @@ def map_photographs(
                 results.append(function(item, index))
             except CurviregError as error:
                 failed = isinstance(item, CurviregError)
-                results.append(FailedRegistration(error) if failed else _failure(error, index))
+                results.append(FailedRegistration(error) if failed else failure(error, index))
     return results
 
 
-def _failure(error: CurviregError, index: int) -> FailedRegistration:
+def failure(error: CurviregError, index: int) -> FailedRegistration:
     return FailedRegistration(error.with_subject("").of_image(index))
 
 
-def _with_corrected_boxes(
-    target: Target, items: Sequence[Photograph | CurviregError], results: Sequence[Result]
-) -> list[Result]:
+def _with_corrected_boxes(target: Target, items: Items, results: Sequence[Result]) -> list[Result]:
     """Results, with those of another box where the pose asks for one in which it is seen better."""
     found = list(results)
     changed: dict[int, Photograph] = {}
@@ -177,7 +179,7 @@ def _other_box(target: Target, item: Photograph, result: Registration) -> Tensor
     return box if alike and item.shows_other_part(box) else None
 
 
-def register_boxes(target: Target, items: Sequence[Photograph | CurviregError]) -> list[Result]:
+def register_boxes(target: Target, items: Items) -> list[Result]:
     """Register photographs in their boxes. Those with a mask and those without are blocks of their
     own: a mask weights the edges of all."""
     found: dict[int, Result] = {
@@ -294,15 +296,20 @@ def rank(target: Target, photographs: Sequence[Photograph], query: QueryFeatures
     )
 
 
+def allowed_views(target: Target, limits: Sequence[Limits | None]) -> Tensor | None:
+    """(P, N) bool: the views of the bank that the limits of each photograph allow; None if no
+    photograph has limits."""
+    if all(one is None for one in limits):
+        return None
+    everything = torch.ones(len(target.bank), dtype=torch.bool)
+    return torch.stack([everything if one is None else one.allowed() for one in limits])
+
+
 def _rankings(
     target: Target, query: QueryFeatures, limits: Sequence[Limits | None]
 ) -> list[Ranking]:
     """The ranking of each photograph."""
-    allowed = None
-    if any(one is not None for one in limits):
-        everything = torch.ones(len(target.bank), dtype=torch.bool)
-        allowed = torch.stack([everything if one is None else one.allowed() for one in limits])
-    rankings = target.matcher.rank(query, allowed).split()
+    rankings = target.matcher.rank(query, allowed_views(target, limits)).split()
     return [
         replace(ranking, allowed=None, outside=None) if one is None else ranking
         for ranking, one in zip(rankings, limits, strict=True)

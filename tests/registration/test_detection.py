@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -22,7 +21,7 @@ from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.matching.detector import _medoids
 from curvireg_torch.registration import Detector, Proposals, detect
 from curvireg_torch.registration import detection as detection_module
-from curvireg_torch.registration.detection import DescribedBox, RegisteredBox, _add, _allowed_views
+from curvireg_torch.registration.detection import RegisteredBox, _add, _allowed_views
 from curvireg_torch.registration.photograph import Photograph
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from curvireg_torch.visualization.words import corners
@@ -182,7 +181,7 @@ def test_the_most_certain_of_all_proposals_is_reported(registrar, found, monkeyp
 
 def as_found(result, **changes):
     where = result.detection
-    known = where.box, where.response, None, None, where.score
+    known = 0, where.box, where.response, None, where.score
     return replace(RegisteredBox(*known, registration=result), **changes)
 
 
@@ -198,7 +197,7 @@ def test_an_object_at_no_convincing_place_is_lost(registrar, found, monkeypatch,
     """Instead of a pose the answer says where it may be, and asks for a box."""
     certain = replace(found[2], probabilities=(1.0,))
     one = replace(as_found(certain), score=score)
-    monkeypatch.setattr(detection_module, "_register_candidates", lambda *_: [one])
+    monkeypatch.setattr(detection_module, "_register_candidates", lambda *_: {0: [one]})
     result = registrar([found[0]])[0]
     assert result.ok != lost
     if lost:
@@ -372,7 +371,7 @@ def test_medoids_are_the_centres_of_clusters():
 def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_each(score, kept):
     def at(x0, score):
         box = torch.tensor([x0, 0.0, x0 + 10.0, 10.0])
-        return RegisteredBox(box, 1.0, None, None, score, registration=None)
+        return RegisteredBox(0, box, 1.0, None, score, registration=None)
 
     found = [at(0.0, 0.9), at(5.0, 0.3)]
     _add(found, at(2.0, score))
@@ -381,16 +380,41 @@ def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_ea
     assert [one.score for one in found] == [*kept, 0.1]
 
 
-@pytest.mark.parametrize(("gain", "kept"), [(-0.01, True), (0.01, False)])
-def test_box_around_the_pose_is_registered_where_it_is_more_certain(
-    registrar, found, monkeypatch, gain, kept
+def test_boxes_around_poses_are_registered_where_they_are_more_certain(
+    registrar, found, monkeypatch
 ):
-    one = as_found(found[2])
-    other = as_found(found[2])
-    again = SimpleNamespace(score=one.score + gain, register=lambda *_: other)
-    monkeypatch.setattr(DescribedBox, "compared", lambda *_, **__: again)
-    best = detection_module._refined(registrar, Photograph(found[0], found[1], None), one)
-    assert best is (one if kept else other)
+    """Of those around which the object is outside the photograph nothing supports the pose."""
+    ones = [as_found(found[2]) for _ in range(3)]
+    others = [as_found(found[2])]
+    again = [replace(ones[0], score=ones[0].score - 0.01), InvalidInputError("outside")]
+    again.append(replace(ones[2], score=ones[2].score + 0.01))
+    asked = []
+    monkeypatch.setattr(detection_module, "_scored", lambda *_: again)
+    monkeypatch.setattr(
+        detection_module, "_registered", lambda *args: asked.append(args[2]) or others
+    )
+    best = detection_module._refined(registrar, {0: Photograph(found[0], found[1], None)}, ones)
+    assert best[0] is ones[0]
+    assert best[1].score == 0.0
+    assert best[2] is others[0]
+    assert asked == [[again[2]]]
+
+
+def test_photographs_are_searched_together_as_alone(registrar, found):
+    """One that cannot be searched fails alone, and each answer is that of its own photograph."""
+    images = [found[0], torch.zeros_like(found[0]), pasted_scene(5, (200, 120), 0.45)[0]]
+    together = detect(registrar, images, instances=2)
+    for number, image in enumerate(images):
+        (alone,) = detect(registrar, [image], instances=2)
+        assert len(together[number]) == len(alone)
+        for one, other in zip(together[number], alone, strict=True):
+            assert one.ok == other.ok == (number != 1)
+            if one.ok:
+                assert torch.allclose(one.detection.box, other.detection.box, atol=0.05)
+                assert rotation_error(one.rotation, other.rotation) < 0.05
+                assert one.confidence == pytest.approx(other.confidence, abs=0.01)
+            else:
+                assert str(one.error) == str(other.error).replace("image 0", f"image {number}")
 
 
 def test_scores_are_relative_to_the_view_elsewhere_in_the_photograph():
