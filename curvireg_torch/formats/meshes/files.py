@@ -161,6 +161,8 @@ def _read_off(source: MeshSource) -> ReadMesh:
         raise ValueError("the file ends too early")
     vertices = np.array([line[:3] for line in lines[1 : 1 + V]], dtype=np.float64).reshape(-1, 3)
     faces = [list(map(int, line[1 : 1 + int(line[0])])) for line in lines[1 + V : 1 + V + F]]
+    if F and len(faces[-1]) < int(lines[V + F][0]):
+        raise ValueError("the file ends too early")
     return ReadMesh(vertices, triangles_of_faces(vertices, faces)[0])
 
 

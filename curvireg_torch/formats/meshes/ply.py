@@ -36,6 +36,9 @@ _TEXTURE_FILE = re.compile(
 # not know
 _CORNERS = re.compile(rb"^(property[ \t]+list[ \t]+\w+[ \t]+\w+[ \t]+)texcoord\b", re.MULTILINE)
 _OWN_CORNERS = "corner_uv"
+# Number of a kind of rows, and its properties; of each property whether it is a list
+_ROWS = re.compile(rb"^element[ \t]+\w+[ \t]+(\d+)[^\n]*\n((?:property[^\n]*\n)*)", re.MULTILINE)
+_PROPERTIES = re.compile(rb"^property[ \t]+(list[ \t])?", re.MULTILINE)
 _REMARK = re.compile(rb"^(?:comment|obj_info)[^\n]*\n", re.MULTILINE)
 
 
@@ -48,11 +51,12 @@ def read_ply(source: MeshSource) -> ReadMesh:
     if max(header.count(b"property"), header.count(b"element")) > MAX_COLUMNS:
         raise ValueError(f"more than {MAX_COLUMNS:,} kinds of rows or columns")
     names = [name.strip() for name in _TEXTURE_FILE.findall(header)]
+    plain = _REMARK.sub(b"", header.replace(b"\r\n", b"\n"))
     if b"ascii" in header[:100]:
         check_lines(body)
+        _check_last_line(plain, body)
     else:
         body = body.removeprefix(b"\r")
-    plain = _REMARK.sub(b"", header.replace(b"\r\n", b"\n"))
     plain = plain.decode("ascii", errors="replace").encode()
     plain = _CORNERS.sub(rb"\1" + _OWN_CORNERS.encode(), plain)
     raw = trimesh.exchange.ply.load_ply(
@@ -78,6 +82,19 @@ def read_ply(source: MeshSource) -> ReadMesh:
     name = next((name for name in _FACE_LISTS if name in polygons.names), polygons.names[0])
     faces = _Faces(*_divided(vertices, polygons.lists(name)))
     return ReadMesh(vertices, faces.vertices, _colours(source, points, polygons, names, faces))
+
+
+def _check_last_line(header: bytes, body: bytes) -> None:
+    """Refuse a last line that has fewer values than the last rows have: trimesh takes a list that
+    ends early for a shorter one."""
+    kinds = [properties for count, properties in _ROWS.findall(header) if int(count)]
+    values = body.rstrip().rpartition(b"\n")[2].split()
+    needed = 0
+    for length in _PROPERTIES.findall(kinds[-1] if kinds else b""):
+        is_list = length and needed < len(values) and values[needed].isdigit()
+        needed += 1 + (int(values[needed]) if is_list else 0)
+    if needed > len(values):
+        raise ValueError("the file ends within its last row")
 
 
 class _Faces(NamedTuple):

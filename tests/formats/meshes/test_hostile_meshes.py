@@ -176,11 +176,20 @@ AXES = b"".join(b"property float %c\n" % axis for axis in b"xyz")
 PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000\n"
 PLY += b"property list uchar int vertex_indices\nend_header\n"
 
+QUAD = (PLY % (b"ascii", 4)).replace(b"9000000", b"1") + b"0 0 0\n1 0 0\n1 1 0\n0 1 0\n"
+
 
 def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path, monkeypatch):
     for name, content, match in (
         ("a.off", b"OFF\n1000000000 1000000000 0\n0 0 0\n", "too early"),
         ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
+        ("a.off", b"OFF\n4 1 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2\n", "too early"),
+        ("a.ply", QUAD + b"4 0 1 2\n", "ends within its last row"),
+        (
+            "a.ply",
+            QUAD.replace(b"vertex_indices", b"vertex_indices\nproperty float s") + b"4 0 1 2 3",
+            "ends within its last row",
+        ),
         ("a.ply", PLY % (b"binary_little_endian", 10**9) + b"\0\0", "early"),
         ("a.ply", PLY % (b"ascii", 1) + b"0 0 0\n3 0 0 0\n", "ends before the last face"),
         ("a.stl", b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50, "it was cut while"),
