@@ -99,14 +99,6 @@ class _Features(Rows):
 
 
 @dataclass(frozen=True)
-class KeypointPose:
-    """A pose ``T`` (4, 4) and the number of keypoints that agree with it."""
-
-    T: Tensor
-    count: int
-
-
-@dataclass(frozen=True)
 class KeypointMatches:
     """Features of a photograph that resemble keypoints of a mesh with a ``centre`` (3,) and a
     ``radius``: pixels ``uv`` (M, 2), ``points`` (M, 3) of the mesh, and where each pair alone has
@@ -124,13 +116,15 @@ class KeypointMatches:
     least: int
     per_view: float
 
-    def poses(self) -> list[KeypointPose]:
-        """Poses on which at least ``least`` agree, the largest number first."""
+    def poses(self) -> tuple[Tensor, Tensor]:
+        """Poses (N, 4, 4) on which at least ``least`` agree, and how many, (N,) float32, the
+        largest number first."""
         near = np.abs(self.centres[:, None] - self.centres) < CLUSTER_DISTANCE * np.sqrt(
             self.radii[:, None] * self.radii
         )
         near &= np.abs(np.log(self.radii[:, None] / self.radii)) < math.log(CLUSTER_FACTOR)
-        poses = []
+        poses = [torch.zeros(0, 4, 4, dtype=torch.float64)]
+        counts: list[int] = []
         left = np.ones(len(self.uv), dtype=bool)
         for _ in range(MAX_CLUSTERS):
             votes = (near & left).sum(axis=1) * left
@@ -138,7 +132,7 @@ class KeypointMatches:
                 break
             cluster = near[votes.argmax()] & left
             size = float(np.median(self.radii[cluster]))
-            pose = _pose(
+            found = _pose(
                 self.points[cluster] - self.centre,
                 self.uv[cluster],
                 self.K,
@@ -146,12 +140,15 @@ class KeypointMatches:
                 self.least,
             )
             left &= ~cluster
-            if pose is not None:  # what is left at its place has no other one
+            if found is not None:  # what is left at its place has no other one
+                T, count = found
                 centre = torch.from_numpy(self.centre)
-                T = pose_around(pose.T[:3, :3], pose.T[:3, 3], centre)
-                poses.append(KeypointPose(T, pose.count))
+                poses.append(pose_around(T[:3, :3], T[:3, 3], centre)[None])
+                counts.append(count)
                 left &= np.abs(self.centres - self.centres[cluster].mean()) > size
-        return sorted(poses, key=lambda pose: -pose.count)
+        number = torch.tensor(counts, dtype=torch.float32)
+        order = number.argsort(descending=True, stable=True)
+        return torch.cat(poses)[order], number[order]
 
     def agreeing(self, T: Tensor, cameras: Tensor | None = None) -> Tensor:
         """(N,) float64 number of keypoints that agree with fitted poses (N, 4, 4); ``cameras`` (N,
@@ -290,9 +287,9 @@ class Keypoints:
 
 def _pose(
     points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float, least: int
-) -> KeypointPose | None:
-    """The pose on which most matches of points (M, 3) and pixels (M, 2) agree within ``error`` px;
-    None if fewer than ``least`` do."""
+) -> tuple[Tensor, int] | None:
+    """The pose (4, 4) on which most matches of points (M, 3) and pixels (M, 2) agree within
+    ``error`` px, and how many; None if fewer than ``least`` do."""
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
             points,
@@ -312,7 +309,7 @@ def _pose(
     T[:3, :3], T[:3, 3] = torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])
     if count < least or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
         return None
-    return KeypointPose(nearest_rigid(T[None])[0], count)
+    return nearest_rigid(T[None])[0], count
 
 
 def _places(uv: np.ndarray, error: float) -> int:

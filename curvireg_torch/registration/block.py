@@ -404,18 +404,17 @@ def keypoint_poses(target: Target, matches: KeypointMatches | None) -> tuple[Hyp
 
     :meta private:
     """
-    found = [] if matches is None else matches.poses()
-    T = (
-        torch.stack([pose.T for pose in found])
-        if found
-        else torch.zeros(0, 4, 4, dtype=torch.float64)
-    )
-    K = torch.eye(3, dtype=torch.float64) if matches is None else torch.from_numpy(matches.K)
+    T = torch.zeros(0, 4, 4, dtype=torch.float64)
+    count = torch.zeros(0)
+    K = torch.eye(3, dtype=torch.float64)
+    if matches is not None:
+        T, count = matches.poses()
+        K = torch.from_numpy(matches.K)
     none = torch.zeros(len(T))
     cameras = K.expand(len(T), 3, 3)
     poses = Hypotheses.at(T, cameras, target.describer.centre, none.long(), none.double())
     views = torch.tensor([nearest_view(target, R) for R in poses.rotation], dtype=torch.long)
-    return replace(poses, view=views), torch.tensor([float(pose.count) for pose in found])
+    return replace(poses, view=views), count
 
 
 def fitted_poses(

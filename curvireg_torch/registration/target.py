@@ -237,7 +237,7 @@ class Target:
         mesh = Mesh(mirrored(known.view_mesh))
         describer = ViewDescriber(mesh, known.settings, device=self.bank.device)
         image = copy(self)
-        vars(image)["describer"] = describer
+        image.describer = describer
         return image
 
     @cached_property
