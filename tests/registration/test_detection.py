@@ -418,6 +418,33 @@ def test_photographs_are_searched_together_as_alone(registrar, found, monkeypatc
                 assert str(one.error) == str(other.error).replace("image 0", f"image {number}")
 
 
+def test_places_of_one_object_leave_room_for_others(monkeypatch):
+    """Two of them lead to the same object; a third one takes the place of the second."""
+    boxes = torch.tensor(
+        [[0.0, 0, 10, 10], [20.0, 0, 30, 10], [40.0, 0, 50, 10], [60.0, 0, 70, 10]]
+    )
+    where = [boxes[0], boxes[0], boxes[2], boxes[3]]
+    asked = []
+
+    def registered(_target, _photographs, some):
+        asked.append([one.response for one in some])
+        at = [RegisteredBox(**{**vars(one), "registration": None}) for one in some]
+        return [replace(one, box=where[int(9 - one.response)]) for one in at]
+
+    monkeypatch.setattr(RegisteredBox, "probability", property(lambda one: one.score))
+    monkeypatch.setattr(detection_module, "_registered", registered)
+    monkeypatch.setattr(detection_module, "_refined", lambda _target, _photographs, some: some)
+    monkeypatch.setattr(
+        detection_module,
+        "_scored",
+        lambda _target, _photographs, some: [replace(one, score=one.response / 10) for one in some],
+    )
+    proposals = Proposals(boxes, torch.tensor([9.0, 8, 7, 6]), torch.zeros(4, dtype=torch.long))
+    found = detection_module._register_candidates(None, {}, {0: proposals}, 2)
+    assert asked == [[9.0, 8.0], [7.0]]
+    assert [one.score for one in found[0]] == [0.9, 0.7]
+
+
 def test_scores_are_relative_to_the_view_elsewhere_in_the_photograph():
     """Level and spread of a view's similarity do not matter."""
     generator = seeded(3)
