@@ -26,7 +26,7 @@ from .confidence import detection_probability, two_decimals
 from .hypotheses import projected_box
 from .photograph import Photograph, as_photographs, check_crop
 from .result import Detection, FailedRegistration, Registration, Results
-from .stages import allowed_views, blocks_of, failure, register_boxes
+from .stages import Items, allowed_views, blocks_of, failure, register_boxes
 from .target import Target
 
 MIN_REGISTERED = 2  # Places that are registered at least, as a fitted pose tells more than its box
@@ -76,9 +76,7 @@ def detect(
 
 
 @torch.no_grad()
-def detect_prepared(
-    target: Target, items: Sequence[Photograph | CurviregError], *, instances: int = 1
-) -> list[Results]:
+def detect_prepared(target: Target, items: Items, *, instances: int = 1) -> list[Results]:
     """:func:`detect` in photographs that :func:`.as_photographs` has prepared."""
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
@@ -91,16 +89,20 @@ def detect_prepared(
 
 def detect_block(
     target: Target,
-    items: Sequence[Photograph | CurviregError],
+    items: Items,
     first: int,
     *,
     instances: int = 1,
 ) -> list[Results]:
     """:func:`detect` in a few photographs, whose boxes do not matter; the ``first`` one's index is
     that of the caller."""
-    errors = {p: item for p, item in enumerate(items) if isinstance(item, CurviregError)}
-    results: dict[int, Results] = {p: [FailedRegistration(one)] for p, one in errors.items()}
-    photographs = {p: item for p, item in enumerate(items) if isinstance(item, Photograph)}
+    results: dict[int, Results] = {}
+    photographs: dict[int, Photograph] = {}
+    for p, item in enumerate(items):
+        if isinstance(item, Photograph):
+            photographs[p] = item
+        else:
+            results[p] = [FailedRegistration(item)]
     proposals: dict[int, Proposals] = {}
     found: dict[int, list[RegisteredBox] | CurviregError] = {}
     for p, item in photographs.items():

@@ -14,6 +14,7 @@ from ..geometry.framing import boxes_at
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability
 from ..utils.likes import ArrayLike, CameraLike, ImagesLike
+from ..utils.precision import exact_convolutions
 from .block import Described, evidence_of
 from .camera import focal_covariance
 from .confidence import are_near, is_calibrated, refinement_confidence
@@ -25,8 +26,8 @@ from .hypotheses import (
     hypothesis_of,
 )
 from .photograph import MIN_BOX_SIDE, Photograph, as_photographs, check_cameras, check_crop
-from .result import Registration, Results
-from .stages import map_photographs, register
+from .result import FailedRegistration, Registration, Results
+from .stages import Items, failure, register
 from .target import Target, nearest_view
 
 FACTORS = {
@@ -146,7 +147,7 @@ def refine(
 @torch.no_grad()
 def refine_prepared(
     target: Target,
-    items: Sequence[Photograph | CurviregError],
+    items: Items,
     poses: ArrayLike,
     *,
     start_confidences: Sequence[float | None] | None = None,
@@ -163,9 +164,18 @@ def refine_prepared(
         raise InvalidInputError(
             f"refine: expected starts of {len(items)} photographs, got {len(starts)}"
         )
-    return map_photographs(
-        items, lambda item, i: refine_one(target, item, starts[i], limit=limits[i])
-    )
+    results: Results = []
+    with exact_convolutions():
+        for index in range(len(items)):
+            item = items[index]  # read on demand
+            if isinstance(item, CurviregError):
+                results.append(FailedRegistration(item))
+                continue
+            try:
+                results.append(refine_one(target, item, starts[index], limit=limits[index]))
+            except CurviregError as error:
+                results.append(failure(error, index))
+    return results
 
 
 def refine_one(

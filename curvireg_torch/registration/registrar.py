@@ -25,7 +25,7 @@ from .photograph import OnDemand, Photograph, as_photographs
 from .refinement import refine
 from .result import FailedRegistration, Registration, Results
 from .several import register_views
-from .stages import register_block, register_photographs, share_of_worker
+from .stages import Items, register_block, register_photographs, share_of_worker
 from .target import Target
 
 __all__ = ["Registrar"]
@@ -191,9 +191,7 @@ class Registrar(Target):
 
     @torch.no_grad()
     @in_full_precision
-    def register_prepared(
-        self, items: Sequence[Photograph | CurviregError], *, detects: bool = False
-    ) -> Results:
+    def register_prepared(self, items: Items, *, detects: bool = False) -> Results:
         """Register photographs that :func:`.as_photographs` has prepared, each to the best of
         the meshes; ``detects`` searches for the object in the whole photographs.
 
@@ -227,7 +225,7 @@ class Registrar(Target):
         return register_views(self, images, boxes, camera_matrices, T_cam_from_world)
 
 
-def _detected(target: Target, items: Sequence[Photograph | CurviregError], first: int) -> Results:
+def _detected(target: Target, items: Items, first: int) -> Results:
     """The most probable object in each of a few photographs."""
     return [found[0] for found in detect_block(target, items, first)]
 
@@ -272,7 +270,7 @@ def _matcher_of(
 def _register_by_workers(
     registrar: Registrar,
     workers: Workers,
-    items: Sequence[Photograph | CurviregError],
+    items: Items,
     *,
     detects: bool,
 ) -> Results:

@@ -3,7 +3,6 @@ screen, fit, refit, judge."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -121,25 +120,8 @@ def register_photographs(
     return results
 
 
-def map_photographs(items: Items, function: Callable[[Photograph, int], Any]) -> list[Any]:
-    """Results of ``function(item, index)`` for photographs one by one, a
-    :class:`FailedRegistration` for each error. Items are read on demand, so that few are in
-    memory."""
-    results = []
-    with exact_convolutions():
-        for index in range(len(items)):
-            item = items[index]
-            try:
-                if isinstance(item, CurviregError):
-                    raise item
-                results.append(function(item, index))
-            except CurviregError as error:
-                failed = isinstance(item, CurviregError)
-                results.append(FailedRegistration(error) if failed else failure(error, index))
-    return results
-
-
 def failure(error: CurviregError, index: int) -> FailedRegistration:
+    """Why the photograph with this index has no pose."""
     return FailedRegistration(error.with_subject("").of_image(index))
 
 
