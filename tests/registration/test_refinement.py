@@ -78,8 +78,10 @@ def test_refine_refuses_wrong_arguments_and_a_start_that_does_not_show_the_mesh(
         image, _, T = scene(0)
         T = T.clone()
         T[:3, 3] += torch.tensor(move)
-        result = registrar.refine([image], CAMERA, [T])[0]
+        unreadable, result = registrar.refine(["none.png", image], CAMERA, [T, T])
+        assert "none.png" in str(unreadable.error)
         assert isinstance(result.error, LostObjectError)
+        assert str(result.error).startswith("image 1: ")
         assert message in str(result.error)
     for poses, camera, message in (
         ([torch.eye(4)], None, "camera matrix"),
