@@ -205,11 +205,13 @@ def as_mesh(source: MeshLike, *, name: str = "mesh") -> Mesh:
     colours = None
     if isinstance(source, trimesh.Scene):
         try:
-            whole, colours = joined_scene(source)
+            found = joined_scene(source)
         except Exception as error:  # singular transforms, unconnected parts, malformed vertices
             raise MeshError(
                 f"its parts cannot be put together ({error}); re-export the file", subject=name
             ) from error
+        whole = trimesh.Trimesh(found.vertices, found.faces, process=False)
+        colours = found.colours
     elif isinstance(source, trimesh.Trimesh):
         (colours,) = colours_of_parts([source])
     mesh = _cleaned(whole, colours, (), name)

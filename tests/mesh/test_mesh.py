@@ -174,6 +174,16 @@ def test_places_of_parts_are_multiplied_from_the_root():
     np.testing.assert_allclose(as_mesh(scene).bounds, expected, atol=1e-9)
 
 
+def test_a_mirrored_part_of_a_scene_keeps_the_colours_of_its_corners():
+    """Its faces are turned over, and the colours of their corners with them."""
+    box = trimesh.creation.box((2.0, 2.0, 2.0))
+    box.visual.vertex_colors = np.where(box.vertices > 0, 255, 0).astype(np.uint8)
+    mesh = as_mesh(trimesh.Scene(box).apply_transform(np.diag([1.0, -1.0, 1.0, 1.0])))
+    corners = mesh.vertices[mesh.faces] * [1.0, -1.0, 1.0]
+    np.testing.assert_array_equal(mesh.colours.corners, np.where(corners > 0, 255, 0))
+    assert mesh.surface.volume == pytest.approx(8.0)
+
+
 def test_a_degenerate_face_takes_no_colours_away(tmp_path):
     points = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
     (tmp_path / "a.mtl").write_text("newmtl a\nKd 1 0 0\nnewmtl b\nKd 0 0 1\n")

@@ -181,15 +181,10 @@ def read_collada(source: MeshSource) -> ReadMesh:
         scene = trimesh.load(
             BytesIO(data), file_type="dae", resolver=_Pictures(source), process=False
         )
-        mesh, colours = joined_scene(scene)
+        found = joined_scene(scene)
     for warning in caught:
         if "texture" in str(warning.message) or "colours" in str(warning.message):
             source.warn("texture", str(warning.message))
-    if mesh is None:
-        return ReadMesh.joined([])
-    found = ReadMesh(
-        np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), colours
-    )
     if "unit" in stated:
         found = found.in_unit_of(float(stated["unit"].get("meter", "1")))
     return replace(found, up={"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}.get(axis))

@@ -3,10 +3,11 @@
 import numpy as np
 import trimesh
 
-from .colours import SurfaceColours, colours_of_parts
+from .colours import colours_of_parts
+from .source import ReadMesh
 
 
-def joined_scene(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceColours | None]:
+def joined_scene(scene: trimesh.Scene) -> ReadMesh:
     """One mesh of a scene's parts at their places: ``scene.dump()`` takes time with the cube of a
     part's depth, and would pack textures into one that cannot repeat."""
     geometry = {
@@ -16,7 +17,6 @@ def joined_scene(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceC
     forest = scene.graph.transforms
     world = {scene.graph.base_frame: np.eye(4)}
     parts = []
-    found = []
     for node in scene.graph.nodes_geometry:
         path = [node]
         while path[-1] not in world and path[-1] in forest.parents:
@@ -27,15 +27,7 @@ def joined_scene(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceC
             world[child] = world[parent] @ forest.edge_data[parent, child].get("matrix", np.eye(4))
         name = forest.node_data[node]["geometry"]
         if name in geometry:
-            bare = trimesh.Trimesh(geometry[name].vertices, geometry[name].faces, process=False)
-            parts.append(bare.apply_transform(world[node]))
-            found.append(colours[name])
-    if not parts:
-        return None, None
-    mesh = trimesh.util.concatenate(parts)
-    if all(each is None for each in found):
-        return mesh, None
-    pairs = zip(found, parts, strict=True)
-    return mesh, SurfaceColours.cat(
-        [each or SurfaceColours.plain(len(part.faces)) for each, part in pairs]
-    )
+            vertices = np.array(geometry[name].vertices, np.float64)
+            faces = np.array(geometry[name].faces, np.int64)
+            parts.append(ReadMesh(vertices, faces, colours[name]).transformed(world[node]))
+    return ReadMesh.joined(parts)
