@@ -67,17 +67,15 @@ class ObjectCrops(Dataset[dict[str, Tensor]]):
         self.classes = sorted(set(names), key=_numeric_order)
         class_ids = {name: number for number, name in enumerate(self.classes)}
         self._class_ids = [class_ids[name] for name in names]
-        self._indices = [
-            index
-            for index, item in enumerate(dataset._items)
-            if all(map(math.isfinite, item["box"]))
-        ]
+        reasons = [_reason_to_leave_out(item) for item in dataset._items]
+        self._indices = [index for index, reason in enumerate(reasons) if reason is None]
+        self._left_out = Counter(filter(None, reasons))
 
     @property
     def skipped(self) -> Counter[str]:
-        """Number of objects left out because their box is unknown, beside those that the dataset
-        skipped."""
-        return Counter({**self.dataset.skipped, "unknown_box": len(self.dataset) - len(self)})
+        """Number of objects left out because their box is unknown, or nothing of them is visible,
+        beside those that the dataset skipped."""
+        return self.dataset.skipped + self._left_out
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -93,13 +91,16 @@ class ObjectCrops(Dataset[dict[str, Tensor]]):
         annotation = self.annotation(index)
         number = self._indices[index]
         sample = self.dataset[number]
-        crop = crop_images(
-            sample["image"][None], annotation["box"][None], size=self.size, margin=self.margin
-        )[0][0]
+        try:
+            crop = crop_images(
+                sample["image"][None], annotation["box"][None], size=self.size, margin=self.margin
+            )[0][0]
+        except InvalidInputError as error:  # in an epoch of thousands, a box alone is not found
+            raise error.with_subject(annotation["image_path"]) from None
         return {
             "image": crop if self.transform is None else self.transform(crop),
             "rotation": annotation["rotation"],
-            "viewpoint_bins": viewpoint_bins(_viewpoint_of(annotation), self.bins),
+            "viewpoint_bins": viewpoint_bins(annotation["rotation"], self.bins),
             "class_id": torch.tensor(self._class_ids[number]),
         }
 
@@ -134,7 +135,8 @@ def crops(
         - ``class_id`` () int64, index of ``classes``: categories, or the object's numbers of a BOP
           set
 
-        Objects without a box are left out and counted in ``skipped``.
+        Objects without a box (``unknown_box``) and those of which nothing is visible
+        (``invisible``) are left out and counted in ``skipped``.
 
     Raises:
         InvalidInputError: another kind of dataset, or an option is out of range.
@@ -148,13 +150,15 @@ def crops(
     return ObjectCrops(dataset, size, margin=margin, bins=bins, transform=transform)
 
 
-def viewpoint_bins(viewpoint: Tensor, bins: Sequence[int]) -> Tensor:
-    """(3,) int64 bins of azimuth, elevation and theta (3,) in degrees; -100 for an unknown
-    viewpoint."""
-    if not bool(viewpoint.isfinite().all()):
+def viewpoint_bins(rotation: Tensor, bins: Sequence[int]) -> Tensor:
+    """(3,) int64 bins of azimuth, elevation and theta of a rotation (3, 3); -100 for an unknown
+    one."""
+    if not bool(rotation.isfinite().all()):
         return torch.full((len(_ANGLES),), UNKNOWN_CLASS)
+    # not as annotated, where an elevation may lie past the pole
+    viewpoint = [float(angle) for angle in viewpoint_from_rotation(rotation.double())]
     numbers = []
-    for angle, start, extent, count in zip(viewpoint.tolist(), _START, _RANGE, bins, strict=True):
+    for angle, start, extent, count in zip(viewpoint, _START, _RANGE, bins, strict=True):
         # Rounded, so that 30 degrees that a rotation gives back as 29.9999 lie in the bin that
         # begins there.
         degrees = round(angle - start, 3)
@@ -164,12 +168,11 @@ def viewpoint_bins(viewpoint: Tensor, bins: Sequence[int]) -> Tensor:
     return torch.tensor(numbers)
 
 
-def _viewpoint_of(annotation: Sample) -> Tensor:
-    """(3,) azimuth, elevation and theta in degrees: as annotated, else those of the rotation."""
-    if "viewpoint" in annotation:
-        viewpoint: Tensor = annotation["viewpoint"]
-        return viewpoint
-    return torch.stack(viewpoint_from_rotation(annotation["rotation"].double()))
+def _reason_to_leave_out(item: Sample) -> str | None:
+    """Why no crop is made of an object, or None."""
+    if not all(map(math.isfinite, item["box"])):
+        return "unknown_box"
+    return "invisible" if item.get("visib_fract") == 0.0 else None
 
 
 def _class_of(item: Sample) -> str:

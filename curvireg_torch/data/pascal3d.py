@@ -128,7 +128,7 @@ class Pascal3DPlus(ObjectDataset):
     def _ids(self, category: str) -> list[str]:
         for path in self._list_files(category):
             if path.is_file():
-                text = path.read_text(encoding="utf-8", errors="replace")
+                text = path.read_text(encoding="utf-8-sig", errors="replace")
                 rows = map(str.split, text.splitlines())
                 return [row[0] for row in rows if row and row[1:2] != ["-1"]]
         names = " or ".join(str(p.relative_to(self.root)) for p in self._list_files(category))

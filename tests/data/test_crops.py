@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader, Subset
 
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset, Pascal3DPlus, PoseFolder, crops
-from curvireg_torch.data.crops import UNKNOWN_CLASS, _viewpoint_of, viewpoint_bins
+from curvireg_torch.data.crops import UNKNOWN_CLASS, viewpoint_bins
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.crops import crop_images
@@ -73,13 +73,20 @@ def test_objects_of_bop_sets_are_classes_and_those_without_a_box_are_counted(
     cropped = crops(dataset, 16)
     unknown = sum(bool(dataset.annotation(i)["box"].isnan().any()) for i in range(len(dataset)))
     assert unknown == 1
-    assert len(cropped) == len(dataset) - 1
-    assert cropped.skipped["unknown_box"] == 1
+    hidden = [i for i in range(len(dataset)) if dataset.annotation(i)["visib_fract"] == 0.0]
+    assert len(cropped) == len(dataset) - 2
+    assert (cropped.skipped["unknown_box"], cropped.skipped["invisible"]) == (1, len(hidden))
     assert cropped.skipped["missing_image"] == dataset.skipped["missing_image"] > 0
     assert cropped.classes == ["1", "2"]
     assert [cropped.classes[int(crop["class_id"])] for crop in cropped] == [
-        str(dataset.annotation(i)["obj_id"]) for i in range(len(cropped))
+        str(cropped.annotation(i)["obj_id"]) for i in range(len(cropped))
     ]
+    # its box may lie outside of the photograph
+    assert hidden
+    assert not {cropped.annotation(i)["visib_fract"] for i in range(len(cropped))} & {0.0}
+    cropped.dataset._items[0]["box"] = (1000.0, 0.0, 1010.0, 10.0)
+    with pytest.raises(InvalidInputError, match=r"000000\.jpg: box \(1000, .*entirely outside"):
+        cropped[0]
 
 
 def test_numbers_of_objects_are_ordered_by_value(tmp_path):
@@ -113,16 +120,14 @@ def test_unknown_poses_have_no_bin(tmp_path):
         ((345.0, -89.0, -180.0), [23, 0, 0]),
         ((-15.0, 45.0, 180.0), [23, 9, 0]),
         ((0.0, 90.0, 0.0), [0, 11, 12]),
+        ((30.0, 100.0, 0.0), [14, 11, 0]),
+        ((30.0, -100.0, 0.0), [14, 0, 0]),
     ],
 )
 def test_viewpoint_bins(viewpoint, expected):
     """Borders belong to the upper bin, whatever the rounding of the rotation."""
-    assert viewpoint_bins(torch.tensor(viewpoint), (24, 12, 24)).tolist() == expected
     rotation = rotation_from_viewpoint(*viewpoint).float()  # as samples have it
-    if abs(viewpoint[1]) < 90.0:  # there azimuth and theta are one angle
-        assert (
-            viewpoint_bins(_viewpoint_of({"rotation": rotation}), (24, 12, 24)).tolist() == expected
-        )
+    assert viewpoint_bins(rotation, (24, 12, 24)).tolist() == expected
 
 
 def test_crops_transform_and_split(tmp_path):
