@@ -405,7 +405,7 @@ class Pipeline:
         if not path.is_file():
             raise MissingFileError(f"{path}: no such pipeline; write one with Pipeline().to_json()")
         try:
-            return cls.from_json(path.read_text(encoding="utf-8"))
+            return cls.from_json(path.read_text(encoding="utf-8-sig"))
         except (InvalidInputError, UnicodeDecodeError) as error:
             raise InvalidInputError(f"{path}: {error}") from error
 

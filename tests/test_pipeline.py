@@ -113,7 +113,8 @@ def test_json_contains_every_setting():
 
 def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_mistake(tmp_path):
     path = tmp_path / "mine.json"
-    path.write_text(json.dumps({"box_jitter": 0.0, "terms": {"hog": {"weight": 2.0}}}))
+    text = json.dumps({"box_jitter": 0.0, "terms": {"hog": {"weight": 2.0}}})
+    path.write_text("\ufeff" + text, encoding="utf-8")  # as editors of Windows write it
     assert Pipeline.read(path) == Pipeline(box_jitter=0.0, terms=(Correlation(weight=2.0),))
     with pytest.raises(MissingFileError, match="no such pipeline"):
         Pipeline.read(tmp_path / "none.json")

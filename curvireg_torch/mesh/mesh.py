@@ -189,7 +189,7 @@ def _question(unit: str | None) -> str:
 
 
 def as_mesh(source: MeshLike, *, name: str = "mesh") -> Mesh:
-    """A mesh from a path, a ``trimesh.Trimesh``, whose ``units`` are kept, or a ``trimesh.Scene``;
+    """A mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``, whose ``units`` are kept;
     a :class:`Mesh` as it is. Errors are those of :func:`load_mesh`.
 
     Example:
@@ -215,7 +215,7 @@ def as_mesh(source: MeshLike, *, name: str = "mesh") -> Mesh:
     elif isinstance(source, trimesh.Trimesh):
         (colours,) = colours_of_parts([source])
     mesh = _cleaned(whole, colours, (), name)
-    return replace(mesh, unit=_unit_of(whole), file_name=whole.metadata.get("file_name", ""))
+    return replace(mesh, unit=_unit_of(source), file_name=source.metadata.get("file_name", ""))
 
 
 def _cleaned(
@@ -304,7 +304,7 @@ def checked_triangles(
     return faces, ~(area > 0)
 
 
-def _unit_of(surface: trimesh.Trimesh) -> str | None:
+def _unit_of(surface: Any) -> str | None:
     """The unit that ``surface.units`` names, as a key of ``UNITS``; None where it names none of
     them."""
     if surface.units in UNITS:

@@ -218,7 +218,7 @@ def read_json(path: Path, kind: type[Any] | tuple[type[Any], ...], readme: str) 
         raise MissingFileError(f"no such file; {readme} shows the layout", subject=path)
     check_table_size(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise InvalidInputError(
             f"damaged, or not JSON ({error}); {readme} shows the layout", subject=path

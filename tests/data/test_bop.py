@@ -270,6 +270,14 @@ def test_bop_dataset_reads_nested_matrices_and_zeros_before_numbers(tree):
     torch.testing.assert_close(after[0]["rotation"], before[0]["rotation"])
 
 
+def test_files_of_bop_may_begin_with_a_byte_order_mark(tree):
+    before = BOPDataset(tree[0])
+    for path in tree[0].rglob("*.json"):
+        path.write_text("\ufeff" + path.read_text(), encoding="utf-8")
+    after = BOPDataset(tree[0])
+    assert (ids(after), after.skipped) == (ids(before), before.skipped)
+
+
 def test_bop_dataset_names_folders_that_are_no_scenes(tree):
     for scene in (tree[0] / "test").iterdir():
         scene.rename(scene.with_name(f"scene_{scene.name}"))

@@ -86,6 +86,7 @@ def test_the_best_box_of_yolo(tmp_path, photo):
     ("line", "score", "track"),
     [
         ("0 0.5 0.5 0.5 0.5", 1.0, ""),
+        ("\ufeff0 0.5 0.5 0.5 0.5", 1.0, ""),  # with a byte-order mark
         ("0 0.5 0.5 0.5 0.5 0.25", 0.25, ""),
         ("0 0.5 0.5 0.5 0.5 7", 1.0, "7"),  # of yolo track
         ("0 0.5 0.5 0.5 0.5 0.25 7", 0.25, "7"),

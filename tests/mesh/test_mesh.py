@@ -250,4 +250,4 @@ def test_a_mesh_does_not_change_with_what_it_was_made_of():
 def test_as_mesh_keeps_the_unit_of_trimesh(units, unit):
     box = trimesh.creation.box()
     box.units = units
-    assert as_mesh(box).unit == unit
+    assert as_mesh(box).unit == as_mesh(trimesh.Scene(box)).unit == unit

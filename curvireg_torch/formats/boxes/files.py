@@ -82,7 +82,7 @@ def read_boxes(file: Path) -> list[ImageBox]:
 
 def _text(file: Path) -> str:
     check_table_size(file)
-    return file.read_text(encoding="utf-8", errors="replace")
+    return file.read_text(encoding="utf-8-sig", errors="replace")
 
 
 def _refused(what: str) -> InvalidInputError:
