@@ -92,7 +92,7 @@ class FunctionModule(nn.Module):
                 self.register_parameter(f"log_{name}", nn.Parameter(log))
             elif name == "camera_matrix":
                 # not all devices have float64
-                camera = value.float() if isinstance(value, Tensor) else value
+                camera = value.float() if isinstance(value, Tensor) else None
                 self.register_buffer(name, camera, persistent=False)
             else:
                 setattr(self, name, tuple(value) if isinstance(value, list) else value)
@@ -146,11 +146,16 @@ class FunctionModule(nn.Module):
         texts = []
         if "camera_matrix" in options:
             texts.append("orthographic" if options.pop("camera_matrix") is None else "perspective")
-        for name, value in options.items():
-            texts.append(
-                f"{name}={round(float(value.detach()), 6) if isinstance(value, Tensor) else value!r}"  # noqa: E501
-            )
+        texts += [f"{name}={_short_text(value)}" for name, value in options.items()]
         return ", ".join(texts)
+
+
+def _short_text(value: Any) -> str:
+    """An option: of tensors, the value of a scalar that can be read, or the shape."""
+    if not isinstance(value, Tensor):
+        return repr(value)
+    is_number = value.ndim == 0 and not value.is_meta
+    return str(round(float(value.detach()), 6)) if is_number else f"<{tuple(value.shape)}>"
 
 
 class DepthModule(FunctionModule):

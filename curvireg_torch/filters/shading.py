@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_camera_matrix, check_same_device, check_tensor
+from ..utils.checks import check_camera_matrix, check_last_axes, check_same_device, check_tensor
 from . import operations as ops
 from .curvilinear import apply_to_depth, default_to_x, dominant_eigenvector, scaled_direction
 from .modules import DepthModule
@@ -65,8 +65,8 @@ def _field_of_normals(
     """Vectors along which the normal changes fastest, of a length that follows from the trace and
     half the eigenvalue difference of its structure tensor, and from the direction (vx, vy)."""
     if camera_matrix is not None:
-        check_tensor(camera_matrix, "camera_matrix", (None,) * (camera_matrix.ndim == 3) + (3, 3))
-        if camera_matrix.ndim == 2 or len(camera_matrix) == 1:
+        check_last_axes(camera_matrix, "camera_matrix", (3, 3))
+        if camera_matrix.shape[:-2] in ((), (1,)):
             camera_matrix = camera_matrix.expand(depth.shape[0], -1, -1)
         check_tensor(camera_matrix, "camera_matrix", (depth.shape[0], 3, 3))
         check_same_device(camera_matrix, depth, "camera_matrix")

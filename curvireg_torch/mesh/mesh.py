@@ -201,7 +201,8 @@ def as_mesh(source: MeshLike, *, name: str = "mesh") -> Mesh:
         return source
     if isinstance(source, str | PathLike):
         return load_mesh(source)
-    whole: Any = source
+    given: Any = source
+    whole = given
     colours = None
     if isinstance(source, trimesh.Scene):
         try:
@@ -215,7 +216,7 @@ def as_mesh(source: MeshLike, *, name: str = "mesh") -> Mesh:
     elif isinstance(source, trimesh.Trimesh):
         (colours,) = colours_of_parts([source])
     mesh = _cleaned(whole, colours, (), name)
-    return replace(mesh, unit=_unit_of(source), file_name=source.metadata.get("file_name", ""))
+    return replace(mesh, unit=_unit_of(given), file_name=given.metadata.get("file_name", ""))
 
 
 def _cleaned(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from curvireg_torch import features
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.features import field_points, hog
-from curvireg_torch.filters import image_gradient
+from curvireg_torch.filters import ImageGradient, image_gradient
 from tests._support.numbers import seeded
 
 from ..filters.layer_cases import photos
@@ -152,6 +152,8 @@ def test_field_points_of_a_ridge_two_pixels_wide_are_one_pixel_wide():
 @pytest.mark.parametrize("learnable", [False, True])
 def test_hog_on_the_meta_device(learnable):
     layer = features.HOG(grid=4, learnable=learnable).to("meta")
+    assert repr(layer).endswith(f"bin_weights={'<(9,)>' if learnable else None})")
+    assert "sigma=<()>" in repr(ImageGradient(learnable=True).to("meta"))
     descriptors = layer(torch.zeros(3, 2, 40, 48, device="meta"))
     assert (descriptors.device.type, descriptors.shape) == ("meta", (3, layer.length))
 

@@ -25,6 +25,7 @@ WRONG = [
     ("mfc", {"threshold": 1.0}, "threshold: expected 0 <= threshold < 1, got 1.0"),
     ("mfc", {"threshold": -0.1}, "threshold: expected a finite number >= 0"),
     ("asg", {"camera_matrix": torch.eye(4)}, "camera_matrix: expected shape"),
+    ("asg", {"camera_matrix": [[1.0]]}, r"camera_matrix: expected a torch\.Tensor, got list"),
     (
         "asg",
         {"camera_matrix": torch.eye(3), "depth_scale": 1.0},
@@ -157,6 +158,7 @@ def test_learnable_modules_can_be_pickled_saved_and_halved(name):
         assert torch.equal(one(x), module(x))
         assert one.options.keys() == module.options.keys()
         assert list(one.state_dict()) == list(module.state_dict())
+        assert repr(one) == repr(module)
     half = copies[0].half()
     found = half(x.half())
     assert found.dtype == torch.float16
