@@ -97,13 +97,14 @@ def run(arguments: argparse.Namespace) -> None:
     """Follow the object; write its poses, and draw them."""
     source = arguments.frames
     out = arguments.out
-    live = source.isdecimal() or "://" in source
+    # a folder may be called 000001, as a scene of BOP
+    live = not Path(source).exists() and (source.isdecimal() or "://" in source)
     packages = ["nicegui"] if arguments.show else []
-    check_given([] if live else [Path(source)], [arguments.mesh], packages=packages)
     if not live and not Path(source).exists():
         raise MissingFileError(
             "no such folder or video; or give the number of a camera, or rtsp://...", subject=source
         )
+    check_given([] if live else [Path(source)], [arguments.mesh], packages=packages)
     load_libraries()
     from ..utils.threads import one_torch_thread
 

@@ -171,6 +171,7 @@ CONFLICTS = {
         "one result"
         for name in ("scheduler", "jobs")
     },
+    "boxes videos": "--boxes are of photographs; give frames as pictures, or use curvireg follow",
     "every !videos": "--every applies to the frames of videos; leave it out",
     "start box|mask|listed|meshes": "--start refines one mesh in one photograph; leave --box, "
     "--mask and --list out",

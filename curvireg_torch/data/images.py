@@ -2,6 +2,7 @@
 
 import math
 import re
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import MAX_IMAGE_PIXELS, ImageError
+from ..errors import MAX_IMAGE_PIXELS, CurviregWarning, ImageError
 from ..formats.pictures import (
     DIAGONAL_35MM,
     Metadata,
@@ -49,6 +50,9 @@ ANIMATED = "one of several pictures"
 
 # Longer side over the shorter one beyond which a picture is a panorama, or a strip of another one
 PANORAMA_PROPORTIONS = 2.5
+
+# of the frames that a video announces, which some do a little wrong: one with fewer was cut
+LEAST_FRAMES = 0.9
 
 
 @dataclass(frozen=True)
@@ -376,6 +380,9 @@ class Video:
                 number += 1
             if number == 0:
                 raise ImageError("a video without frames; save it again", subject=self.path)
+            if number < LEAST_FRAMES * self.count:
+                cut = f"{self.path}: ends after {number} of {self.count} frames; copy it again"
+                warnings.warn(cut, CurviregWarning, stacklevel=2)
         finally:
             file.release()
 

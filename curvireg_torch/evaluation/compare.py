@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from ..errors import InvalidInputError
+from ..errors import InvalidInputError, MissingFileError
 from ..utils.files import read_csv, read_json
 from .registry import DATASETS
 
@@ -20,9 +20,8 @@ Interval = tuple[float, float]
 CONFIDENCE = 0.95
 RESAMPLES = 2000  # of the bootstrap
 SEED = 0
-ADVICE = (
-    "docs/evaluation.md; the same 'curvireg evaluate' again writes it without registering anything"
-)
+ADVICE = "the same 'curvireg evaluate' again writes it without registering anything"
+README = "docs/evaluation.md"
 
 
 @dataclass(frozen=True)
@@ -69,13 +68,11 @@ def read_run(folder: Path) -> Run:
         MissingFileError: no ``summary.json`` or ``errors.csv``.
         InvalidInputError: files that are damaged, or not of an evaluation.
     """
-    summary = read_json(folder / "summary.json", dict, ADVICE)
+    summary = read_json(_existing(folder / "summary.json"), dict, README)
     settings = summary.get("settings")
     if not isinstance(settings, dict) or settings.get("dataset") not in DATASETS:
         raise InvalidInputError("not of an evaluation", subject=folder / "summary.json")
-    path = folder / "errors.csv"
-    if not path.is_file():
-        read_json(path, dict, ADVICE)  # says that it is missing
+    path = _existing(folder / "errors.csv")
     header, *rows = read_csv(path) or [[]]
     try:
         errors = {row[0]: _numbers(header[2:], row[2:]) for row in rows}
@@ -84,6 +81,13 @@ def read_run(folder: Path) -> Run:
     return Run(
         str(folder), settings["dataset"], {**settings, "protocol": summary.get("protocol")}, errors
     )
+
+
+def _existing(path: Path) -> Path:
+    """The path of a file of a run; :class:`MissingFileError` if there is none."""
+    if not path.is_file():
+        raise MissingFileError(f"no such file; {ADVICE}", subject=path)
+    return path
 
 
 def _numbers(names: Sequence[str], cells: Sequence[str]) -> dict[str, float]:

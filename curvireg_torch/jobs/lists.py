@@ -179,7 +179,8 @@ def find_photographs(path: Path) -> list[Path]:
     pattern = pattern_of(path)
     if not (path.is_dir() or pattern):
         return [path]
-    inside = map(Path, glob.glob(pattern, recursive=True)) if pattern else path.iterdir()
+    # without hidden files, as a Mac leaves them beside photographs (._1.jpg)
+    inside = map(Path, glob.glob(pattern or f"{glob.escape(str(path))}/*", recursive=True))
     photographs = [found for found in inside if found.suffix.lower() in IMAGES and found.is_file()]
     if not photographs:
         raise MissingFileError(f"{path}: no photographs ({', '.join(IMAGES)}); check the path")
@@ -293,7 +294,7 @@ def register_list(
     }
     with output_folder(out, "register several", inputs=files, source=source):
         store = run_entries(usable, out, open_registrar, **how)
-        asked = {dict(entry.cells).get("photo") for entry in entries}
+        asked = {entry.name for entry in entries}
         if removed := sum(photo not in asked for photo in store.photos()):
             text = f"{out}: {removed} results of photographs that are not asked for any more go"
             warnings.warn(text, CurviregWarning, stacklevel=2)

@@ -53,6 +53,10 @@ def _open_bank(
     if mesh.suffix != ".safetensors":
         loaded = options.load_mesh(mesh)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
+    if options.link is not None:
+        raise BankError(
+            "a bank has the links that it was built with; leave --link out", subject=mesh
+        )
     unit = options.unit if options.unit_is_given else None
     bank = load_bank(mesh, unit=unit, up=options.up)
     if options.pose not in (None, bank.pipeline.views.pose):

@@ -75,7 +75,8 @@ class ResultStore:
     def photos(self) -> list[str]:
         """The photographs of rows of finished runs, as their lists named them."""
         columns = [json.loads(line).get("columns", {}) for _, line in self._rows.values()]
-        return [cells["photo"] for cells in columns if "photo" in cells]
+        cells = [cell for row in columns for cell in row.items()]
+        return [photo.strip() for column, photo in cells if column.strip().lower() == "photo"]
 
     def append(self, row: Row) -> None:
         """Put a row on disk; numbers that are not finite become null. :class:`OutputError` if this

@@ -483,8 +483,7 @@ def camera_warnings(K: Tensor, size: tuple[int, int]) -> list[str]:
         )
         found.append(
             f"the focal length of {focal:g} px gives the photograph of {W} x {H} px a field of "
-            f"view of {degrees:.2g} "
-            f"degrees; {advice}"
+            f"view of {degrees:.3g} degrees; {advice}"
         )
     return found
 

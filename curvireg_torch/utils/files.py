@@ -365,7 +365,9 @@ def only_in(folder: Path) -> FindFile:
 
 
 def check_table_size(path: Path) -> None:
-    """Refuse a table that is too large to be read as a whole."""
+    """Refuse a table that is a folder, or too large to be read as a whole."""
+    if path.is_dir():
+        raise InvalidInputError("a folder where a file is expected; name the file", subject=path)
     if path.stat().st_size > MAX_TABLE_BYTES:
         raise InvalidInputError(
             f"larger than {MAX_TABLE_BYTES:,} bytes; split the set", subject=path

@@ -97,7 +97,7 @@ def cases(folder: Path) -> list[tuple[str, str]]:
             line = command.format(
                 f"{place.name}/{name}", folder=f"{place.name}/{Path(name).parent}"
             )
-        if "--out" not in line and not line.startswith("view"):
+        if "--out" not in line and not line.startswith(("view", "compare")):
             line += " --out out.safetensors" if line.startswith("bank") else " --out out"
         found.append((line.replace("BOX", "--box 30 25 210 160"), expected))
     return found
@@ -148,7 +148,8 @@ def write_files(folder: Path) -> None:
     for name in ("text.jpg", "text.obj", "truck.step"):
         (folder / name).write_text("not what the name says")
     (folder / "empty.png").touch()
-    (folder / "empty").mkdir()
+    for name in ("empty", "0001"):
+        (folder / name).mkdir()
     for name in ("photo.png", "truck.ply", "truck.safetensors"):
         data = (folder / name).read_bytes()
         (folder / name.replace("photo", "cut").replace("truck", "cut")).write_bytes(

@@ -168,7 +168,7 @@ def test_wrong_inputs_are_named(tmp_path, monkeypatch, capsys):
     wrong = []
     for line, expected in cases(tmp_path):
         try:
-            quiet = [] if line.startswith(("view", "frobnicate")) else ["--quiet"]
+            quiet = [] if line.startswith(("view", "frobnicate", "compare")) else ["--quiet"]
             code = main([*shlex.split(line), *quiet])
         except SystemExit as stop:  # of argparse
             code = stop.code

@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch.data import Video
 from curvireg_torch.data.frames import KEPT, FrameReader
-from curvireg_torch.errors import ImageError, InvalidInputError
+from curvireg_torch.errors import CurviregWarning, ImageError, InvalidInputError
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +34,16 @@ def test_video_yields_rgb_frames_and_their_numbers(five):
     assert torch.equal(some[4], frames[4])
     with pytest.raises(InvalidInputError, match="every"):
         Video(five, every=0)
+
+
+def test_a_video_that_was_cut_says_so(five, tmp_path):
+    data = five.read_bytes()
+    cut = tmp_path / "cut.avi"
+    cut.write_bytes(
+        data[: data.index(b"idx1") - 2 * (data.index(b"idx1") - data.index(b"movi")) // 5]
+    )
+    with pytest.warns(CurviregWarning, match=r"cut\.avi: ends after 3 of 5 frames"):
+        assert len(list(Video(cut))) == 3
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".webm", ".mov"])

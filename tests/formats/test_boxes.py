@@ -142,6 +142,7 @@ def test_results_of_coco(tmp_path, photo, image):
         tmp_path / "boxes.json", [item(image, 0.2, (0, 0, 9, 9)), item(image, 0.8), item(7, 1.0)]
     )
     assert box_of(file, photo) == BOX
+    file.write_text(f"\ufeff{file.read_text()}", encoding="utf-8")
     assert box_of(f"{file}:3", photo) == BOX
     with pytest.raises(InvalidInputError, match="no box of label '4'"):
         box_of(f"{file}:4", photo)

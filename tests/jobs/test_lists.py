@@ -12,7 +12,7 @@ import torch
 
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
-from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.errors import CurviregWarning, InvalidInputError
 from curvireg_torch.formats.poses import PoseRecord
 from curvireg_torch.jobs import lists, photograph, runner
 from curvireg_torch.jobs.entry import Entry, camera_of, prepare, start_in_unit
@@ -79,6 +79,15 @@ def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, 
         for _ in range(2):
             assert register_rows(rows, tmp_path / "out", registrar, settings).posed == 5
         assert done == rows[:4], "equal rows are registered once"
+
+
+@pytest.mark.parametrize("column", ["photo", " Photo"])
+def test_results_of_photographs_that_a_list_no_longer_names_go(registrar, entry, tmp_path, column):
+    rows = [replace(entry, name=name, cells={column: f"{name} "}) for name in ("a.png", "b.png")]
+    register_rows(rows, tmp_path / "out", registrar)
+    register_rows(rows, tmp_path / "out", registrar)
+    with pytest.warns(CurviregWarning, match="out: 1 results of photographs"):
+        register_rows(rows[:1], tmp_path / "out", registrar)
 
 
 def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp_path):
@@ -243,7 +252,7 @@ def test_names_are_in_the_order_of_their_numbers(tmp_path):
         "10.png",
         "2.png",
     ]
-    for name in names:
+    for name in (*names, "._a.png"):  # the last is what a Mac leaves beside a.png
         (tmp_path / name).touch()
     expected = [
         "1.png",
