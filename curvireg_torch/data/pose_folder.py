@@ -65,7 +65,8 @@ class PoseFolder(ObjectDataset):
             self._index(folder)
 
     def _index(self, folder: Path) -> None:
-        meshes = [*filter(Path.is_file, (folder / f"mesh{suffix}" for suffix in MESHES))]
+        named = sorted(path for path in folder.iterdir() if path.stem == "mesh" and path.is_file())
+        meshes = [path for path in named if path.suffix.lower() in MESHES]
         if len(meshes) > 1:
             raise InvalidInputError(
                 f"expected one mesh, got {', '.join(p.name for p in meshes)}", subject=folder

@@ -12,7 +12,8 @@ class PoseFolderBenchmark(Benchmark):
     camera.
 
     Photographs of unknown pose are registered too. They count in ``n``, ``reliable`` and
-    ``mean_confidence``; accuracy and errors are those of the ``n_posed`` others.
+    ``mean_confidence``, None without calibrated confidences; accuracy and errors are those of the
+    ``n_posed`` others.
     """
 
     name = "web"
@@ -42,11 +43,13 @@ class PoseFolderBenchmark(Benchmark):
             if len(posed)
             else dict.fromkeys((*self.thresholds, "med_err_deg"))
         )
-        confidences = [rows[i].get("confidence") or 0.0 for i in chosen]
+        # 0 without a pose; None of a pipeline whose confidence is not calibrated
+        confidences = [rows[i].get("confidence", 0.0) for i in chosen]
+        is_calibrated = bool(chosen) and None not in confidences
         return {
             **scores,
             "n": len(chosen),
             "n_posed": len(posed),
             "reliable": sum(bool(rows[i].get("reliable")) for i in chosen),
-            "mean_confidence": sum(confidences) / len(chosen) if chosen else None,
+            "mean_confidence": sum(confidences) / len(chosen) if is_calibrated else None,
         }

@@ -43,8 +43,13 @@ def test_pose_folder_refuses_unusable_roots(tree, tmp_path):
         with pytest.raises(MissingFileError, match=r"datasets/web/README\.md"):
             PoseFolder(root)
     write_mesh(tree[0] / "cup" / "mesh.ply")
-    with pytest.raises(InvalidInputError, match=r"one mesh.*mesh\.ply, mesh\.off"):
+    with pytest.raises(InvalidInputError, match=r"one mesh.*mesh\.off, mesh\.ply"):
         PoseFolder(tree[0])
+
+
+def test_the_ending_of_a_mesh_may_be_in_capitals(tree):
+    (tree[0] / "cup" / "mesh.off").rename(tree[0] / "cup" / "mesh.OFF")
+    assert PoseFolder(tree[0])[0]["mesh_path"].endswith("mesh.OFF")
 
 
 # Python 3.12 warns of fork beside threads

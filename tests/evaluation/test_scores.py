@@ -231,6 +231,8 @@ def test_pose_folders_score_known_poses(web):
         "acc_15_deg": None, "acc_30_deg": None, "med_err_deg": None,
     }  # fmt: skip
     assert benchmark.errors(benchmark.samples[:1], [FAILED])["error_deg"].tolist() == [torch.inf]
+    unknown = [*rows[:2], {**rows[2], "confidence": None}, FAILED]
+    assert benchmark.summary(benchmark.samples, unknown, errors)["mean_confidence"] is None
 
 
 def test_detection_is_scored_in_single_photographs(bop, tmp_path):

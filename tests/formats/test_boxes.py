@@ -167,6 +167,16 @@ PIXELS = (16, 12, 32, 24)  # BOX in COCO
 CORNER = (1, 1, 8, 8)  # OTHER
 
 
+def test_numbers_of_images_that_come_twice_are_refused(tmp_path):
+    content = annotations(("a.png", PIXELS), ("b.png", CORNER))
+    content["images"][1]["id"] = 90
+    file = written(tmp_path / "boxes.json", content)
+    with pytest.raises(InvalidInputError, match=r"boxes.json: two entries have the id 90, as in"):
+        box_of(file, "a.png")
+    content["images"][1]["file_name"] = "a.png"
+    assert box_of(written(file, {**content, "annotations": content["annotations"][:1]}), "a.png")
+
+
 def test_annotations_of_coco_name_images_and_categories(tmp_path):
     file = written(tmp_path / "boxes.json", annotations(("shots\\000012.png", PIXELS)))
     assert box_of(f"{file}:can", "shots/000012.png") == BOX
@@ -278,7 +288,8 @@ def test_boxes_of_two_labels_without_scores_need_a_choice(tmp_path):
         box_of(file, "a.jpg")
     assert box_of(f"{file}:box", "a.jpg") == box_of(f"{file}:4", "a.jpg") == BOX
     content["annotations"][1]["category_id"] = 3  # two of a kind: the first
-    assert box_of(written(tmp_path / "two.json", content), "a.jpg") == OTHER
+    with pytest.warns(CurviregWarning, match="2 boxes of one label, .*: the first one is used"):
+        assert box_of(written(tmp_path / "two.json", content), "a.jpg") == OTHER
 
 
 # ---- LabelMe, VOC, and folders -------------------------------------------------------------------

@@ -205,9 +205,15 @@ def _coco(content: Document) -> Iterator[ImageBox]:
 
 
 def _by_id(entries: Any) -> dict[str, Document]:
-    """The dicts of a list by their ``id``."""
-    known = entries if isinstance(entries, list) else []
-    return {str(entry.get("id")): entry for entry in known if isinstance(entry, dict)}
+    """The dicts of a list by their ``id``; of two that differ none is believed."""
+    known: dict[str, Document] = {}
+    for entry in entries if isinstance(entries, list) else []:
+        number = str(entry.get("id")) if isinstance(entry, dict) else None
+        if number is not None and known.setdefault(number, entry) != entry:
+            raise InvalidInputError(
+                f"two entries have the id {number}, as in files that were joined; number them anew"
+            )
+    return known
 
 
 def _size(height: Any, width: Any) -> Size | None:

@@ -266,7 +266,8 @@ def _matching(folders: Sequence[str], around: Sequence[str]) -> int:
 
 
 def _best(boxes: Sequence[ImageBox]) -> ImageBox:
-    """The box of the highest score; two that differ in what they show are refused."""
+    """The box of the highest score, of several that show the same the first; two that differ in
+    what they show are refused."""
     most = max(box.score for box in boxes)
     best = [box for box in boxes if box.score == most]
     tracks = dict.fromkeys(box.track for box in best)
@@ -281,6 +282,9 @@ def _best(boxes: Sequence[ImageBox]) -> ImageBox:
             "boxes of several labels, none with a higher score; choose one as PATH:LABEL: "
             f"{listed(kinds)}"
         )
+    if len({box.corners for box in best}) > 1:
+        text = f"{len(best)} boxes of one label, none of a higher score: the first one is used"
+        warnings.warn(CurviregWarning(text), stacklevel=2)
     return best[0]
 
 
