@@ -150,6 +150,7 @@ def crop_images(
         check_tensor(images, "images", (None, None, None, None))
     for image in images:
         check_tensor(image, "images", (None, None, None))
+        check_tensor(image, "images", (len(images[0]), None, None))
     check_integer(size, "size")
     boxes = as_boxes(boxes, len(images))
     check_boxes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])

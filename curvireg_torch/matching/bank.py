@@ -520,9 +520,10 @@ def _check_contents(
         raise ValueError("viewpoints that are not finite")
     if (
         not tensors["descriptors"].any()
-        or not (tensors["boxes"][:, 2:] > tensors["boxes"][:, :2]).all()
+        # a sheet that is seen from its edge has a box of no height
+        or not (tensors["boxes"][:, 2:] >= tensors["boxes"][:, :2]).all()
     ):
-        raise ValueError("descriptors that are all zero, or empty boxes")
+        raise ValueError("descriptors that are all zero, or boxes of negative size")
 
 
 def _packings(

@@ -274,7 +274,8 @@ def as_numbers(values: Any, name: str, *, dtype: torch.dtype = torch.float32) ->
             parts = [] if plain else [as_numbers(value, name, dtype=dtype) for value in values]
             x = torch.tensor(values, dtype=dtype) if plain else torch.stack(parts)
         else:
-            x = torch.as_tensor(values)
+            # as_tensor would move a tensor to the default device
+            x = values if isinstance(values, Tensor) else torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
         reason = str(error).partition("\n")[0]
         raise InvalidInputError(

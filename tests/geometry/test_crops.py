@@ -68,6 +68,12 @@ def test_check_boxes_refuses_boxes_without_pixels():
             check_boxes(torch.tensor([[0.0, 0.0, 5.0, 5.0], box]), [(20, 30), (20, 30)])
 
 
+def test_crop_images_refuses_a_list_of_grey_and_colour():
+    images = [torch.rand(3, 20, 30), torch.rand(1, 20, 30)]
+    with pytest.raises(InvalidInputError, match=r"images: expected shape \(3, \*, \*\), got \(1,"):
+        g.crop_images(images, [[0, 0, 5, 5], [0, 0, 5, 5]])
+
+
 def test_crop_images_spreads_missing_pixels_no_further_than_its_filter():
     image = torch.rand(1, 3, 60, 80)
     boxes = torch.tensor([[30.0, 20.0, 60.0, 50.0]])

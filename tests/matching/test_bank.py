@@ -67,6 +67,15 @@ def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck, monkeypa
     )
 
 
+def test_a_bank_with_views_of_a_sheet_from_its_edge_is_read_again(tmp_path):
+    corners = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+    sheet = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]])
+    bank = build(sheet, sample_views(azimuth_step=180, elevations=[0, 30]))
+    assert (bank.boxes[:, 1] == bank.boxes[:, 3]).tolist() == [True, True, False, False]
+    bank.save(tmp_path / "sheet.safetensors")
+    assert_same(ViewBank.load(tmp_path / "sheet.safetensors"), bank, atol=1e-3)
+
+
 def test_check_compatible_refuses_another_view_policy(truck):
     upright = build(truck, pipeline=Pipeline(views=UPRIGHT))
     for change, message in (
@@ -154,7 +163,7 @@ def with_nan(x):
     ("name", "change", "message"),
     [
         ("descriptors", with_nan, "not finite"),
-        ("boxes", lambda x: x[:, [2, 1, 0, 3]], "empty"),
+        ("boxes", lambda x: x[:, [2, 1, 0, 3]], "boxes of negative size"),
         ("boxes", lambda x: x[1:], "boxes: not of the shape"),
         ("points", lambda x: x[:, 1:], "points: not of the shape"),
         ("appearance", with_nan, "appearance: .* not finite"),

@@ -207,3 +207,9 @@ def test_check_square_pixels_accepts_ten_per_cent():
             checks.check_square_pixels(
                 torch.stack([CAMERA, changed(CAMERA, (0, 0, 220.1 * ratio))])
             )
+
+
+def test_numbers_of_a_tensor_stay_on_its_device():
+    with torch.device("meta"):  # as with torch.set_default_device
+        boxes = checks.as_boxes(torch.zeros(1, 4, device="cpu"), 1)
+    assert boxes.device.type == "cpu"
