@@ -81,7 +81,8 @@ class Camera:
             raise InvalidInputError(
                 f"focal_deviation: expected a fraction >= 0, got {self.focal_deviation}"
             )
-        given = list(self.distortion)
+        # OpenCV's own arrays are (1, N) or (N, 1)
+        given = as_numbers(self.distortion, "distortion", dtype=torch.float64).flatten().tolist()
         numbers = finite_numbers(given, len(given))
         if numbers is None or len(numbers) not in MODELS[self.model]:
             expected = (

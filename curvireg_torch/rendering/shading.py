@@ -47,7 +47,8 @@ def render_colour(
         True
     """
     mesh = as_mesh(mesh)
-    T, K = check_render_arguments(T_cam_from_model.view(-1, 4, 4), camera_matrix, size)
+    T = T_cam_from_model[None] if T_cam_from_model.ndim == 2 else T_cam_from_model
+    T, K = check_render_arguments(T, camera_matrix, size)
     check_integer(supersampling, "supersampling")
     shift = 0.5 - 0.5 / supersampling
     zoom = torch.tensor([[1.0, 0, shift], [0, 1, shift], [0, 0, 1 / supersampling]])

@@ -78,12 +78,19 @@ def test_unusable_cameras_and_boxes_outside_of_what_is_shown_are_refused():
         undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([200.0, 0, 300, 15]))
     for arguments, words in (
         ({"distortion": (0.1, 0.2)}, "expected 0 or 4 or 5 or 8 or 12 or 14 finite coefficients"),
+        ({"distortion": ("a",) * 4}, "distortion: expected numbers"),
         ({"model": "fisheye"}, "expected 4 finite coefficients"),
         ({"matrix": torch.eye(4)}, r"camera matrix: expected shape \(3, 3\)"),
         ({"size": (0, 640)}, "size of the image"),
     ):
         with pytest.raises(InvalidInputError, match=words):
             Camera(**{"matrix": MATRIX, **arguments})
+
+
+@pytest.mark.parametrize("as_given", [np.array, torch.tensor, lambda x: np.array([x]).T])
+def test_coefficients_may_be_arrays_such_as_those_of_opencv(as_given):
+    camera = Camera(MATRIX, as_given([-0.3, 0.1, 0.0, 0.0]))
+    assert camera.distortion == pytest.approx((-0.3, 0.1, 0.0, 0.0))
 
 
 def test_camera_of_a_resized_photograph():
