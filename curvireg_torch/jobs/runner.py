@@ -95,6 +95,9 @@ def run_entries(
     store = ResultStore(out)
     common = json.dumps([dict(settings), results_digest()], sort_keys=True)
     digest_of_mesh = cache(partial(mesh_digest, textures=textures))
+    digest_of_file = cache(
+        file_digest
+    )  # of a video once, whatever number of its frames is asked for
 
     def task_of(entry: Entry) -> Task:
         meshes = [(path.name, digest_of_mesh(path)) for path in entry.meshes]
@@ -108,7 +111,7 @@ def run_entries(
     with tqdm(desc=label, unit="photo", total=len(entries), disable=not progress) as bar:
 
         def is_pending(task: Task) -> bool:
-            photo = partial(photo_digest, task.entry)
+            photo = partial(photo_digest, task.entry, digest_of_file)
             known = store.is_current(task.entry.key, task.request, photo)
             bar.update(known)
             return not known
@@ -132,9 +135,9 @@ def run_entries(
     return store
 
 
-def photo_digest(entry: Entry) -> str:
+def photo_digest(entry: Entry, digest_of: Callable[[Path], str]) -> str:
     """Digests of the photographs of an entry; "" if one cannot be read."""
-    photos = [file_digest(path) for path in (entry.photo, *(view.photo for view in entry.views))]
+    photos = [digest_of(path) for path in (entry.photo, *(view.photo for view in entry.views))]
     return "-".join(photos) if all(photos) else ""
 
 
@@ -174,7 +177,10 @@ def _register_block(opened: _OpenedRegistrar, tasks: Sequence[Task]) -> list[Fin
     """Register entries of the same meshes."""
     registrar, bank_seconds = opened.of(tasks[0].entry.meshes)
     # before the photographs are read: one that changes meanwhile is registered again
-    digests = [{"request": task.request, "photo": photo_digest(task.entry)} for task in tasks]
+    digest_of = cache(file_digest)
+    digests = [
+        {"request": task.request, "photo": photo_digest(task.entry, digest_of)} for task in tasks
+    ]
     rows = _rows([task.entry for task in tasks], registrar, bank_seconds=bank_seconds)
     return [
         Finished({"digests": known, **row}, picture)

@@ -49,6 +49,7 @@ def test_pose_folder_refuses_unusable_roots(tree, tmp_path):
 
 def test_the_ending_of_a_mesh_may_be_in_capitals(tree):
     (tree[0] / "cup" / "mesh.off").rename(tree[0] / "cup" / "mesh.OFF")
+    write_mesh(tree[0] / "cup" / "draft.ply")
     assert PoseFolder(tree[0])[0]["mesh_path"].endswith("mesh.OFF")
 
 

@@ -166,14 +166,14 @@ def test_only_photographs_with_a_row_are_digested_before_they_are_registered(
 
     def digest(path):
         digested.append(path.name)
-        return path.name
+        return "unchanged"
 
     def register(_, tasks):
         before.append(list(digested))
         return [
             runner.Finished(
                 {
-                    "digests": {"request": task.request, "photo": runner.photo_digest(task.entry)},
+                    "digests": {"request": task.request, "photo": "unchanged"},
                     "verdict": "reliable",
                 },
                 None,
@@ -184,10 +184,21 @@ def test_only_photographs_with_a_row_are_digested_before_they_are_registered(
     monkeypatch.setattr(runner, "file_digest", digest)
     monkeypatch.setattr(runner, "_register_block", register)
     how = {"settings": {}, "label": "", "progress": False}
-    for expected in ([[], ["0.png", "1.png"]], []):
+    for expected, count in (([[], []], []), ([], ["0.png", "1.png"])):
         before = []
         run_entries(entries, tmp_path / "out", None, **how)
         assert before == expected
+        assert digested == count, "each file once, as the video of many frames"
+
+
+def test_a_video_is_digested_once_for_the_frames_of_a_block(entries, monkeypatch):
+    digest = Mock(return_value="of all frames")
+    monkeypatch.setattr(runner, "file_digest", digest)
+    monkeypatch.setattr(runner, "_rows", lambda block, *_, **__: [({}, None)] * len(block))
+    tasks = [runner.Task(entries[0], "request")] * 3
+    found = runner._register_block(Mock(of=lambda _: (None, 0.0)), tasks)
+    assert [one.row["digests"]["photo"] for one in found] == ["of all frames"] * 3
+    digest.assert_called_once_with(entries[0].photo)
 
 
 def test_a_photograph_that_ends_its_worker_fails_and_is_tried_again(entries, tmp_path):
