@@ -1,6 +1,7 @@
 """BOP sets: poses, their errors and the file of results for the BOP challenge."""
 
 import re
+import warnings
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from ..data import BOPDataset
 from ..data.bop_models import model_files, read_models_info
+from ..errors import CurviregWarning
 from ..geometry import symmetry_transforms
 from ..geometry.cameras import transform
 from ..jobs.entry import Entry
@@ -69,6 +71,10 @@ class BOPBenchmark(Benchmark):
                 views = [self._views(i, group) for i in group]
                 for i, others in zip(group, views, strict=True):
                     self.entries[i] = replace(self.entries[i], views=others)
+            few = sum(len(entry.views) + 1 < protocol.views for entry in self.entries)
+            if few:
+                seen = f"{few} of {len(self.entries)} objects are seen in fewer photographs"
+                warnings.warn(f"views={protocol.views}: {seen}", CurviregWarning, stacklevel=2)
 
     def _views(self, first: int, group: Sequence[int]) -> tuple[Entry, ...]:
         """Photographs drawn from those of ``group`` to be registered together with that of the

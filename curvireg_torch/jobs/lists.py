@@ -132,9 +132,9 @@ def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]
     """The photographs of the options, which have the same box, camera and limits on the pose.
 
     A photograph is called by its path as it was given, or that of its folder; a frame of a video by
-    the video's path and its number, as in ``left/cam.avi:000012``. So no two of them share a name.
-    ``every`` n-th frame of videos is taken. Errors are those of :func:`find_photographs`, and of
-    :class:`.Video`.
+    the video's path and its number, as in ``left/cam.avi:000012``. One that is named repeatedly, as
+    by a folder and a pattern, counts once: no two share a name. ``every`` n-th frame of videos is
+    taken. Errors are those of :func:`find_photographs`, and of :class:`.Video`.
     """
     fours = (
         (BOX, options.box),
@@ -155,7 +155,8 @@ def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]
                 entries.append(replace(common, name=name, read_frame=partial(reader.read, number)))
         else:
             entries += [_entry_of(photo, options) for photo in find_photographs(path)]
-    return [replace(entry, cells={"photo": entry.name, **numbers}) for entry in entries]
+    different = {entry.name: entry for entry in entries}
+    return [replace(entry, cells={"photo": name, **numbers}) for name, entry in different.items()]
 
 
 def _entry_of(photo: Path, options: RegisterOptions) -> Entry:

@@ -235,6 +235,7 @@ def test_pose_folders_score_known_poses(web):
     assert benchmark.summary(benchmark.samples, unknown, errors)["mean_confidence"] is None
 
 
+@pytest.mark.filterwarnings("ignore:views=2")
 def test_detection_is_scored_in_single_photographs(bop, tmp_path):
     for views in (1, 2):
         benchmark = BOPBenchmark(bop, Protocol(pose="any", box=None, views=views))
