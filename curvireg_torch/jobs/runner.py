@@ -95,9 +95,7 @@ def run_entries(
     store = ResultStore(out)
     common = json.dumps([dict(settings), results_digest()], sort_keys=True)
     digest_of_mesh = cache(partial(mesh_digest, textures=textures))
-    digest_of_file = cache(
-        file_digest
-    )  # of a video once, whatever number of its frames is asked for
+    digest_of_file = cache(file_digest)  # of a video once, for all its frames
 
     def task_of(entry: Entry) -> Task:
         meshes = [(path.name, digest_of_mesh(path)) for path in entry.meshes]
@@ -111,7 +109,7 @@ def run_entries(
     with tqdm(desc=label, unit="photo", total=len(entries), disable=not progress) as bar:
 
         def is_pending(task: Task) -> bool:
-            photo = partial(photo_digest, task.entry, digest_of_file)
+            photo = partial(_photo_digest, task.entry, digest_of_file)
             known = store.is_current(task.entry.key, task.request, photo)
             bar.update(known)
             return not known
@@ -135,7 +133,7 @@ def run_entries(
     return store
 
 
-def photo_digest(entry: Entry, digest_of: Callable[[Path], str]) -> str:
+def _photo_digest(entry: Entry, digest_of: Callable[[Path], str]) -> str:
     """Digests of the photographs of an entry; "" if one cannot be read."""
     photos = [digest_of(path) for path in (entry.photo, *(view.photo for view in entry.views))]
     return "-".join(photos) if all(photos) else ""
@@ -179,7 +177,7 @@ def _register_block(opened: _OpenedRegistrar, tasks: Sequence[Task]) -> list[Fin
     # before the photographs are read: one that changes meanwhile is registered again
     digest_of = cache(file_digest)
     digests = [
-        {"request": task.request, "photo": photo_digest(task.entry, digest_of)} for task in tasks
+        {"request": task.request, "photo": _photo_digest(task.entry, digest_of)} for task in tasks
     ]
     rows = _rows([task.entry for task in tasks], registrar, bank_seconds=bank_seconds)
     return [
