@@ -122,7 +122,7 @@ def prepare(entry: Entry, photo: Photo | None = None) -> Photograph:
     boxes, masks = (None if given is None else [given] for given in (entry.box, mask))
     item = as_photographs([photo.image], boxes, camera, entry.prior, masks)[0]
     if isinstance(item, CurviregError):
-        is_of_mask = bool(item.subject) and item.subject == str(entry.mask)
+        is_of_mask = item.subject == str(entry.mask)
         raise item.with_subject(item.subject if is_of_mask else entry.name)
     return replace(item, facts={"camera_source": source, "picture": photo.facts()})
 

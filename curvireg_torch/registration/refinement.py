@@ -166,13 +166,13 @@ def refine_prepared(
         )
     results: Results = []
     with exact_convolutions():
-        for index in range(len(items)):
-            item = items[index]  # read on demand
+        # items are read on demand, so that few are in memory
+        for index, (item, start, limit) in enumerate(zip(items, starts, limits, strict=True)):
             if isinstance(item, CurviregError):
                 results.append(FailedRegistration(item))
                 continue
             try:
-                results.append(refine_one(target, item, starts[index], limit=limits[index]))
+                results.append(refine_one(target, item, start, limit=limit))
             except CurviregError as error:
                 results.append(failure(error, index))
     return results
