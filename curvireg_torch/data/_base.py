@@ -27,7 +27,7 @@ class Transforms(TypedDict, total=False):
     transforms: JointTransform | None
 
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".JPEG", ".JPG", ".PNG", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")  # in lower case
 
 
 class ObjectDataset(Dataset[Sample]):

@@ -60,6 +60,7 @@ class BOPDataset(ObjectDataset):
         - ``visib_fract`` float in [0, 1], NaN if unknown; ``model_path`` str; ``model_info`` dict
 
     Reasons in ``skipped``: ``no_target``, ``bad_box`` (no area: the object is outside the image),
+    ``behind_camera`` (a part of the object; translations may be in another unit than mm),
     ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``,
     ``missing_model_info``.
 
@@ -190,11 +191,10 @@ class BOPDataset(ObjectDataset):
         except InvalidInputError:
             return "corrupt_annotation"
         obj_id: int = entry["obj_id"]
-        box = (
-            bop_box(info["bbox_obj"])
-            if "bbox_obj" in info
-            else self._box_of_mesh(obj_id, rotation, translation, _rows(matrix))
-        )
+        if "bbox_obj" in info:
+            box = bop_box(info["bbox_obj"])
+        elif (box := self._box_of_mesh(obj_id, rotation, translation, _rows(matrix))) is None:
+            return "behind_camera"
         if box is None or box[0] == box[2] or box[1] == box[3]:
             return "bad_box"
         visible = finite_numbers([info.get("visib_fract")], 1)
@@ -265,7 +265,7 @@ def _images_by_number(scene: Path) -> dict[int, Path]:
     found = {}
     for name in ("gray", "rgb"):
         for path in sorted((scene / name).glob("*")):
-            if path.suffix in IMAGE_SUFFIXES and path.stem.isdecimal():
+            if path.suffix.lower() in IMAGE_SUFFIXES and path.stem.isdecimal():
                 found[int(path.stem)] = path
     return found
 

@@ -144,8 +144,10 @@ class Pascal3DPlus(ObjectDataset):
             if not is_plain_name(image_id) or not annotation.is_file():
                 self._skip("missing_annotation", item)
                 continue
+            images = self.root / "Images" / folder
             candidates = (
-                self.root / "Images" / folder / (image_id + suffix) for suffix in IMAGE_SUFFIXES
+                images / (image_id + suffix)
+                for suffix in (*IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES))
             )
             image = next((path for path in candidates if path.is_file()), None)
             if image is None:
@@ -179,6 +181,8 @@ class Pascal3DPlus(ObjectDataset):
         )
         if azimuth is None or elevation is None or not distance:
             return "coarse_viewpoint"
+        if distance < 0.0:
+            return "corrupt_annotation"
         cad_index = _number(entry.get("cad_index")) or 0.0
         cad = self.root / "CAD" / category / f"{int(cad_index):02d}.off"
         if not 1 <= cad_index < 1000 or not cad.is_file():

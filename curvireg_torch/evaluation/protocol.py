@@ -75,9 +75,13 @@ class Protocol:
         default of that key."""
         values: dict[str, str | float | int | None] = {"pose": pose}
         named = {"annotated": 0.0, "none": None}
+        given: set[str] = set()
         for word in words:
             key, _, value = word.partition("=")
             check_option(key, [f.name for f in fields(cls)], "protocol")
+            if key in given:
+                raise InvalidInputError(f"protocol: {key} is given twice; give it once")
+            given.add(key)
             try:
                 if key == "box":
                     values[key] = named[value] if value in named else float(value)

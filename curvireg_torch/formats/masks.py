@@ -33,6 +33,16 @@ def mask_file(mask: PathName) -> tuple[Path, int | None]:
     return Path(mask), None
 
 
+def existing_mask(mask: PathName) -> tuple[Path, int | None]:
+    """:func:`mask_file` of a file that exists; refuses one that does not, and a folder."""
+    file, label = mask_file(mask)
+    if file.is_dir():
+        raise InvalidInputError("a folder; give the file of one mask", subject=mask)
+    if not file.is_file():
+        raise MissingFileError("no such file; check the path of the mask", subject=mask)
+    return file, label
+
+
 def read_mask(mask: PathName) -> Singles:
     """(H, W) in [0, 1], 1 = object, of a picture in which the object is white, or one of several
     labels.
@@ -55,9 +65,7 @@ def read_mask(mask: PathName) -> Singles:
         >>> read_mask(f"{file}:2").tolist()
         [[0.0, 1.0], [0.0, 0.0]]
     """
-    file, label = mask_file(mask)
-    if not file.is_file():
-        raise MissingFileError("no such file; check the path of the mask", subject=mask)
+    file, label = existing_mask(mask)
     (values, largest), orientation = decoded(file, _values)
     values = oriented(values, orientation)[..., 0]
     if label is not None:

@@ -90,6 +90,8 @@ class Camera:
                 f"{self.model!r}"
             )
             raise InvalidInputError(f"distortion: expected {expected}, got {given!r:.80}")
+        if self.size is not None and len(self.size) != 2:
+            raise InvalidInputError(f"size: expected height and width in px, got {self.size}")
         for side in self.size or ():
             check_integer(side, "size of the image")
         object.__setattr__(self, "matrix", matrix)

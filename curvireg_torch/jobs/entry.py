@@ -9,9 +9,9 @@ from typing import Any
 from torch import Tensor
 
 from ..data import Photo, read_photo
-from ..errors import CurviregError, InvalidInputError, MissingFileError
+from ..errors import CurviregError, InvalidInputError
 from ..formats.boxes import PictureSize
-from ..formats.masks import mask_as_shown, mask_file
+from ..formats.masks import existing_mask, mask_as_shown, mask_file
 from ..formats.poses import PoseRecord
 from ..geometry import Camera, camera_matrix
 from ..geometry.cameras import camera_of_view
@@ -114,8 +114,8 @@ def prepare(entry: Entry, photo: Photo | None = None) -> Photograph:
     """The photograph of an entry, by default that of its file, once for all meshes; refuses what
     cannot be used, before meshes are opened."""
     photo = entry.read() if photo is None else photo
-    if isinstance(entry.mask, str | PathLike) and not mask_file(entry.mask)[0].is_file():
-        raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
+    if isinstance(entry.mask, str | PathLike):
+        existing_mask(entry.mask)
     camera, source = camera_of(entry, photo)
     H, W = photo.image.shape[-2:]
     mask = mask_as_shown(entry.mask, PictureSize((H, W), photo.orientation))
@@ -150,10 +150,10 @@ def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
     if camera is not None:
         return camera, "exif"
     if given == "exif" or entry.start is not None:
-        is_insisted = given == "exif"
-        wanted = "no focal length in its EXIF" if is_insisted else "a start pose needs the camera"
-        message = f"{wanted}; give the camera"
-        raise InvalidInputError(message, subject=entry.name, kind="camera")
+        message = "a start pose needs the camera; give it"
+        if given == "exif":
+            message = "no focal length in its EXIF; give the camera in another way"
+        raise InvalidInputError(message, subject=entry.name, kind=f"camera {given or ''}".strip())
     return None, None
 
 

@@ -44,6 +44,7 @@ CAMERA_OPTIONS = "--camera FX FY CX CY, --camera FILE (a calibration), --camera 
 
 ADVICE = {
     "camera": f": {CAMERA_OPTIONS}",
+    "camera exif": ": --camera FX FY CX CY, --camera FILE (a calibration) or --fov DEG",
     "calibration": "; without a calibration, use --camera exif",
     "view": ", as --fov DEG",
     "opengl": "; or give --start-convention opengl",

@@ -283,6 +283,11 @@ class ViewMatcher(nn.Module):
         terms, first = self._first_terms(query)
         log, compared = self._with_appearance(query, first)
         if allowed is not None:
+            if allowed.shape != first.shape or allowed.dtype != torch.bool:
+                raise InvalidInputError(
+                    f"allowed: expected bool of shape {tuple(first.shape)}, got {allowed.dtype} of "
+                    f"{tuple(allowed.shape)}"
+                )
             allowed = allowed.to(log.device)
             without_limits = log
             log, compared = self._with_appearance(query, first.masked_fill(~allowed, -torch.inf))

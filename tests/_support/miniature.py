@@ -103,6 +103,7 @@ def write_pascal3d(root, part="pascal"):
             pascal_object("car", cad_index=7),
             pascal_object("car", cad_index=empty),
             pascal_object("car", bbox=np.array([[1.0, 1.0, 9.0, 5.0]])),
+            pascal_object("car", viewpoint={"distance": -4.0}),
         ],
         "2008_000004": [],
     }
@@ -136,7 +137,7 @@ def write_pascal3d(root, part="pascal"):
     reasons = {"other_class": 3, "coarse_viewpoint": 2, "no_viewpoint": 1, "bad_box": 3}
     return reasons | {
         "missing_mesh": 2,
-        "corrupt_annotation": 3,
+        "corrupt_annotation": 4,
         "missing_annotation": 1,
         "missing_image": 1,
     }

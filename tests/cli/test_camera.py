@@ -207,12 +207,13 @@ def test_the_command_line_names_the_options_that_help(folder, register_one, refu
     """The library, which others call from Python, does not know them."""
     refused(
         register_one("--camera", "exif"),
-        "no focal length in its EXIF; give the camera: --camera FX FY CX CY",
+        "no focal length in its EXIF; give the camera in another way: --camera FX FY CX CY, "
+        "--camera FILE (a calibration) or --fov DEG",
     )
     photo = folder / "photos" / "0.png"
     with pytest.raises(InvalidInputError, match="no focal length") as error:
         cr.register(photo, folder / "truck.safetensors", box=box_of(0), camera="exif")
-    assert error.value.kind == "camera"
+    assert error.value.kind == "camera exif"
     assert "--" not in str(error.value).replace(str(photo), "")
     refused(
         register_one("--camera", folder / "none.yaml"), "without a calibration, use --camera exif"

@@ -65,6 +65,11 @@ def test_a_seed_that_draws_nothing_is_refused():
         assert Protocol.parse([word, "seed=3"]).seed == 3
 
 
+def test_a_key_that_is_given_twice_is_refused():
+    with pytest.raises(InvalidInputError, match="protocol: box is given twice"):
+        Protocol.parse(["box=0.1", "box=0.2"])
+
+
 def test_hint_of_truth_is_none_without_truth_or_hint():
     eye = torch.eye(3, dtype=torch.float64)
     assert hint_of_truth(eye, eye, Protocol(), "a") is None

@@ -288,7 +288,7 @@ def test_boxes_of_two_labels_without_scores_need_a_choice(tmp_path):
         box_of(file, "a.jpg")
     assert box_of(f"{file}:box", "a.jpg") == box_of(f"{file}:4", "a.jpg") == BOX
     content["annotations"][1]["category_id"] = 3  # two of a kind: the first
-    with pytest.warns(CurviregWarning, match="2 boxes of one label, .*: the first one is used"):
+    with pytest.warns(CurviregWarning, match=r"a\.jpg: 2 boxes of one label, .*: the first one"):
         assert box_of(written(tmp_path / "two.json", content), "a.jpg") == OTHER
 
 

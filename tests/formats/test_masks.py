@@ -55,6 +55,8 @@ def test_labels_are_chosen_by_their_number(tmp_path):
     assert np.array_equal(read_mask(f"{deep}:600") > 0, OBJECT)
     with pytest.raises(MissingFileError, match=r"lost\.png:2: no such file"):
         read_mask(tmp_path / "lost.png:2")
+    with pytest.raises(InvalidInputError, match="a folder; give the file of one mask"):
+        read_mask(tmp_path)
     assert mask_file("a:b") == mask_file(mask_file("a:b")[0])
 
 

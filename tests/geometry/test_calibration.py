@@ -82,6 +82,7 @@ def test_unusable_cameras_and_boxes_outside_of_what_is_shown_are_refused():
         ({"model": "fisheye"}, "expected 4 finite coefficients"),
         ({"matrix": torch.eye(4)}, r"camera matrix: expected shape \(3, 3\)"),
         ({"size": (0, 640)}, "size of the image"),
+        ({"size": (480, 640, 3)}, r"size: expected height and width in px, got \(480, 640, 3\)"),
     ):
         with pytest.raises(InvalidInputError, match=words):
             Camera(**{"matrix": MATRIX, **arguments})

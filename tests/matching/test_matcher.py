@@ -189,6 +189,15 @@ def test_appearance_is_compared_with_the_views_that_were_compared(small_bank):
             assert score == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.parametrize("allowed", [torch.ones(2, 1).bool(), torch.ones(1, 3)])
+def test_views_that_are_allowed_are_flags_of_all_views(small_bank, allowed):
+    matcher = ViewMatcher(small_bank)
+    image, box, _ = scene(0)
+    query = matcher.query([image], box[None])
+    with pytest.raises(InvalidInputError, match="allowed: expected bool of shape"):
+        matcher.rank(query, allowed)
+
+
 def test_features_of_pictures_are_kept_by_the_name_of_their_renderer(small_bank, tmp_path):
     """What another renderer draws differs; a custom one has no name by which to find it again."""
     small_bank = copy(small_bank)

@@ -147,7 +147,7 @@ class BoxFile:
             boxes = [box for box in boxes if box.track == self.label.removeprefix(ID_LABEL)]
         elif self.label:
             boxes = [box for box in boxes if self.label in box.labels]
-        return _in_pixels(_best(boxes), picture) if boxes else None
+        return _in_pixels(_best(boxes, photo.name), picture) if boxes else None
 
     def _of(self, photo: Path, owner: str) -> list[ImageBox]:
         if self.path.is_dir():
@@ -265,9 +265,9 @@ def _matching(folders: Sequence[str], around: Sequence[str]) -> int:
     return count
 
 
-def _best(boxes: Sequence[ImageBox]) -> ImageBox:
-    """The box of the highest score, of several that show the same the first; two that differ in
-    what they show are refused."""
+def _best(boxes: Sequence[ImageBox], photograph: str) -> ImageBox:
+    """The box of a photograph with the highest score, of several that show the same the first; two
+    that differ in what they show are refused."""
     most = max(box.score for box in boxes)
     best = [box for box in boxes if box.score == most]
     tracks = dict.fromkeys(box.track for box in best)
@@ -284,7 +284,7 @@ def _best(boxes: Sequence[ImageBox]) -> ImageBox:
         )
     if len({box.corners for box in best}) > 1:
         text = f"{len(best)} boxes of one label, none of a higher score: the first one is used"
-        warnings.warn(CurviregWarning(text), stacklevel=2)
+        warnings.warn(CurviregWarning(f"{photograph}: {text}"), stacklevel=2)
     return best[0]
 
 
