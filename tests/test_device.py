@@ -2,6 +2,7 @@ import copy
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 import curvireg_torch as cr
 from curvireg_torch.pipeline import PRESETS
@@ -66,7 +67,7 @@ def test_presets_on_a_gpu(preset):
     registrar = cr.Registrar(bank, device="cuda")
     found = registrar([image.cuda()], box[None], CAMERA)[0]
     expected = cr.ViewMatcher(bank)(image[None], box[None]).scores
-    torch.testing.assert_close(found.ranking.scores.cpu(), expected, atol=0.05, rtol=0.0)
+    assert_close(found.ranking.scores.cpu(), expected, atol=0.05, rtol=0.0)
     assert float(torch.linalg.det(found.rotation)) == pytest.approx(1.0, abs=1e-4)
 
 
@@ -78,5 +79,5 @@ def test_registrar_ignores_the_default_dtype():
         result = cr.Registrar(truck_bank())([image], box[None], CAMERA)[0]
     finally:
         torch.set_default_dtype(torch.float32)
-    torch.testing.assert_close(result.transform, expected.transform, atol=1e-6, rtol=0.0)
+    assert_close(result.transform, expected.transform, atol=1e-6, rtol=0.0)
     assert result.score == pytest.approx(expected.score, abs=1e-6)

@@ -13,7 +13,7 @@ NAMES = [field.name for field in fields(Evidence)]
 
 
 def evidence(count=3, **columns):
-    values = {name: torch.tensor(column).double() for name, column in columns.items()}
+    values = {name: double(column) for name, column in columns.items()}
     nothing = torch.zeros(count, dtype=torch.float64)
     return Evidence(**{name: values.get(name, nothing) for name in NAMES})
 
@@ -46,11 +46,11 @@ def test_a_similar_mesh_keeps_the_order_of_the_ranking():
 def test_evidence_is_read_from_poses():
     seen = {
         "rank": double([0.0, -1.0]),
-        "similarity": torch.tensor([0.7, 0.6]).double(),
-        "edge_support": torch.tensor([0.4, torch.nan]).double(),
+        "similarity": double([0.7, 0.6]),
+        "edge_support": double([0.4, torch.nan]),
         "appearance": double([0.5, -0.5]),
         "keypoints": double([0.0, 20.0]),
-        "contours": torch.tensor([0.3, 0.0]).double(),
+        "contours": double([0.3, 0.0]),
     }
     read = Evidence.measured(**seen)
     assert read.edge_support.tolist() == pytest.approx([0.4, 0.0])

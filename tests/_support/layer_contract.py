@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.testing import assert_close
 
 from curvireg_torch.errors import InvalidInputError
 from tests._support.numbers import double, seeded
@@ -90,7 +91,7 @@ class LayerContract:
         before = x.clone()
         want = case(x)
         twin = case.twin()
-        torch.testing.assert_close(tensors(twin(x)), tensors(want), rtol=0.0, atol=0.0)
+        assert_close(tensors(twin(x)), tensors(want), rtol=0.0, atol=0.0)
         assert torch.equal(x, before)
         assert type(twin).__name__ in repr(twin)
         for y in tensors(want):
@@ -106,7 +107,7 @@ class LayerContract:
             torch.cat(part)
             for part in zip(*(tensors(case(image[None])) for image in x), strict=True)
         ]
-        torch.testing.assert_close(tensors(case(x)), tuple(parts), **self.batch_tolerance)
+        assert_close(tensors(case(x)), tuple(parts), **self.batch_tolerance)
 
     def test_empty_batch(self, case):
         x = case.inputs(2, SIZE)
@@ -120,7 +121,7 @@ class LayerContract:
         assert {t.dtype for t in tensors(y)} == {dtype}
         if dtype is not torch.float64:  # half types compute in float32
             want = tuple(t.to(dtype) for t in tensors(case(x.float())))
-            torch.testing.assert_close(tensors(y), want, rtol=0.0, atol=0.0)
+            assert_close(tensors(y), want, rtol=0.0, atol=0.0)
 
     @pytest.mark.parametrize("image", list(degenerate_images()))
     def test_finite_on_degenerate_input(self, case, image):
@@ -179,15 +180,13 @@ class LayerContract:
         direction = torch.randn(x.shape, dtype=x.dtype, generator=seeded(0))
         if block is not None:
             monkeypatch.setattr("curvireg_torch.filters.operations.BLOCK_PIXELS", block)
-        torch.testing.assert_close(
-            torch.func.vmap(case)(torch.stack([x, 0.5 * x])), torch.stack([y, halved])
-        )
-        torch.testing.assert_close(torch.func.grad(loss)(x), want)
+        assert_close(torch.func.vmap(case)(torch.stack([x, 0.5 * x])), torch.stack([y, halved]))
+        assert_close(torch.func.grad(loss)(x), want)
         _, slope = torch.func.jvp(loss, (x,), (direction,))
-        torch.testing.assert_close(slope, (want * direction).sum())
+        assert_close(slope, (want * direction).sum())
         with torch.autograd.forward_ad.dual_level():
             dual = loss(torch.autograd.forward_ad.make_dual(x, direction))
-            torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(dual).tangent, slope)
+            assert_close(torch.autograd.forward_ad.unpack_dual(dual).tangent, slope)
 
     def test_bad_input_is_rejected(self, case):
         x = case.inputs(1, SIZE)

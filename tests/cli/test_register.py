@@ -17,6 +17,7 @@ from curvireg_torch.matching import list_cache
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, box_of, check_pose
+from tests._support.numbers import double
 from tests._support.quick import slow_after
 from tests._support.scenes import scene, truck_bank
 
@@ -76,7 +77,7 @@ def test_register_upright_mesh_with_another_up_axis(
     T[:3, :3] = up_rotation(up).numpy().T
     example_mesh().apply_transform(T).export(folder / name)
     assert register_one("--pose", "upright", "--no-refine", *options, mesh=name) == 0
-    found = torch.tensor(document()["rotation"]).double()
+    found = double(document()["rotation"])
     assert rotation_error(found, scene(0)[2][:3, :3] @ up_rotation(up)) < 15
 
 
@@ -271,7 +272,7 @@ def test_starts_of_other_tools_have_their_convention_and_unit(
     folder, register_one, refused, document
 ):
     T = scene(0)[2].double()
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    flip = torch.diag(double([1.0, -1.0, -1.0, 1.0]))
     path = folder / "gl.json"
     words = "--start", str(path), "--camera", *CAMERA
     path.write_text(json.dumps({"T_cam_from_model": (flip @ T).tolist()}))
@@ -280,7 +281,7 @@ def test_starts_of_other_tools_have_their_convention_and_unit(
     )
     refused(register_one(*words, box=()), f"behind the camera: {message}")
     assert register_one(*words, "--start-convention", "opengl", box=()) == 0
-    assert rotation_error(torch.tensor(document()["rotation"]).double(), T[:3, :3]) < 3.0
+    assert rotation_error(double(document()["rotation"]), T[:3, :3]) < 3.0
     entry = {
         "cam_R_m2c": T[:3, :3].flatten().tolist(),
         "cam_t_m2c": (1000.0 * T[:3, 3]).tolist(),
@@ -288,9 +289,7 @@ def test_starts_of_other_tools_have_their_convention_and_unit(
     }
     path.write_text(json.dumps({"4": [entry]}))  # mm, of a mesh in m
     assert register_one("--start", f"{path}:4", "--camera", *CAMERA, box=()) == 0
-    torch.testing.assert_close(
-        torch.tensor(document()["translation"]).double(), T[:3, 3], rtol=0.1, atol=0.05
-    )
+    torch.testing.assert_close(double(document()["translation"]), T[:3, 3], rtol=0.1, atol=0.05)
     with pytest.raises(SystemExit):
         register_one("--start-convention", "opengl")
 
@@ -321,7 +320,7 @@ def test_register_refines_a_start_or_writes_that_the_object_is_lost(
     words = "--start", str(path), "--camera", *CAMERA
     assert register_one(*words, box=()) == 0
     result = document()
-    assert rotation_error(torch.tensor(result["rotation"]).double(), scene(0)[2][:3, :3]) < 3.0
+    assert rotation_error(double(result["rotation"]), scene(0)[2][:3, :3]) < 3.0
     assert set(result["confidence_features"]) == {"similarity", "edge_support"}
     pose["translation"][0] += 100.0
     path.write_text(json.dumps(pose))

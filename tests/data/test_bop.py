@@ -3,10 +3,12 @@ import operator
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch.data import BOPDataset
-from curvireg_torch.errors import InvalidInputError, MissingFileError
+from curvireg_torch.errors import MissingFileError
 from tests._support.miniature import write_bop, write_mesh
+from tests._support.refusals import refused
 
 
 @pytest.fixture
@@ -59,7 +61,7 @@ def test_bop_dataset_reads_hidden_instances_and_grey_images_without_scene_gt_inf
     assert hidden["visib_fract"] == 0
     assert hidden["box"].isfinite().all()
     assert hidden["box_visible"].isnan().all()
-    torch.testing.assert_close(sample["image"], torch.full((3, 60, 80), 0.2))
+    assert_close(sample["image"], torch.full((3, 60, 80), 0.2))
     # Of the cube of 50 mm, 375 to 425 mm away: its near face is the wider one.
     near = [40 - 24 * 0.8, 30 - 23 * 310 / 375, 40 + 26 * 0.8, 30 + 27 * 310 / 375]
     assert sample["box"].tolist() == pytest.approx(near)
@@ -106,7 +108,7 @@ def test_scenes_of_several_cameras_are_named(tree):
     assert len(BOPDataset(tree[0], targets=False)) == 4, "files without a camera go first"
     for file in (tree[0] / "test").glob("*/scene_gt.json"):
         file.unlink()
-    with pytest.raises(InvalidInputError, match="several cameras: cam1, cam2; copy the files of"):
+    with refused("several cameras: cam1, cam2; copy the files of"):
         BOPDataset(tree[0])
     for file in (tree[0] / "test").glob("*/scene_gt_cam*.json"):
         file.unlink()
@@ -119,7 +121,7 @@ def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(
             BOPDataset(root, split)
     for content in ("[", "[" * 100000, "[1]", '[{"scene_id": 1}]', "{}"):
         (tree[0] / "test_targets_bop19.json").write_text(content)
-        with pytest.raises(InvalidInputError, match="test_targets_bop19"):
+        with refused("test_targets_bop19"):
             BOPDataset(tree[0])
     (tree[0] / "test_targets_bop19.json").unlink()
     for path in (tree[0] / "models").iterdir():
@@ -147,7 +149,7 @@ def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(
 )
 def test_damaged_models_info_is_refused_when_the_dataset_is_opened(tree, change, match):
     edit(tree, "../../models/models_info.json", change)
-    with pytest.raises(InvalidInputError, match=rf"models_info\.json: .*{match}") as caught:
+    with refused(rf"models_info\.json: .*{match}") as caught:
         BOPDataset(tree[0])
     assert len(str(caught.value)) < 500
 
@@ -220,9 +222,7 @@ def test_bop_dataset_reads_names_with_fewer_digits_and_other_folders_of_models(t
 def test_bop_dataset_refuses_models_in_another_unit_than_models_info(tree, factor):
     for number in (1, 2, 9):
         write_mesh(tree[0] / "models" / f"obj_{number:06d}.ply", half=25.0 * factor)
-    with pytest.raises(
-        InvalidInputError, match=r"across, models_info\.json says 86\.6: .*scale the models to mm"
-    ) as error:
+    with refused(r"across, models_info\.json says 86\.6: .*scale the models to mm") as error:
         BOPDataset(tree[0])
     assert ("in metres?" in str(error.value)) == (factor == 1e-3)
 
@@ -231,9 +231,7 @@ def test_bop_dataset_refuses_models_in_metres_without_models_info(tree):
     (tree[0] / "models" / "models_info.json").unlink()
     for number in (1, 2, 9):
         write_mesh(tree[0] / "models" / f"obj_{number:06d}.ply", half=0.025)
-    with pytest.raises(
-        InvalidInputError, match=r"the mesh is 0\.065 px wide: in metres\? scale it to mm"
-    ):
+    with refused(r"the mesh is 0\.065 px wide: in metres\? scale it to mm"):
         BOPDataset(tree[0])
 
 
@@ -242,9 +240,8 @@ def test_bop_dataset_refuses_poses_in_metres(tree):
         content["0"][0]["cam_t_m2c"] = [value / 1000 for value in content["0"][0]["cam_t_m2c"]]
 
     edit(tree, "scene_gt.json", in_metres)
-    with pytest.raises(
-        InvalidInputError,
-        match=r"image 0 the mesh is 86\.6 across and 0\.4 away: cam_t_m2c in metres",
+    with refused(
+        r"image 0 the mesh is 86\.6 across and 0\.4 away: cam_t_m2c in metres",
     ):
         BOPDataset(tree[0], targets=False)
 
@@ -263,11 +260,11 @@ def test_bop_dataset_reads_nested_matrices_and_zeros_before_numbers(tree):
     edit(tree, "scene_camera.json", nested)
     after = BOPDataset(tree[0], targets=False)
     assert ids(after) == ids(before)
-    torch.testing.assert_close(after[0]["camera_matrix"], before[0]["camera_matrix"])
+    assert_close(after[0]["camera_matrix"], before[0]["camera_matrix"])
     edit(tree, "scene_gt.json", lambda content: nested({"0": content["0"][:1]}))
     after = BOPDataset(tree[0], targets=False)
     assert ids(after) == ids(before)
-    torch.testing.assert_close(after[0]["rotation"], before[0]["rotation"])
+    assert_close(after[0]["rotation"], before[0]["rotation"])
 
 
 def test_files_of_bop_may_begin_with_a_byte_order_mark(tree):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.testing import assert_close
 
 from curvireg_torch.data import images, read_image, read_photo
 from curvireg_torch.errors import ImageError, MissingFileError
@@ -26,10 +27,8 @@ def test_read_image_returns_rgb_floats_in_0_to_1_of_grey_alpha_and_16_bits(
     cv2.imwrite(str(tmp_path / "a.png"), pixels)
     image = read_image(str(tmp_path / "a.png"))
     assert (image.shape, image.dtype, image.is_contiguous()) == ((3, 5, 7), torch.float32, True)
-    torch.testing.assert_close(
-        image[:, 0, 2], torch.tensor([1.0, *[1.0 if channels == 1 else 0.2] * 2])
-    )
-    torch.testing.assert_close(image[:, 1:], torch.full((3, 4, 7), 0.2))
+    assert_close(image[:, 0, 2], torch.tensor([1.0, *[1.0 if channels == 1 else 0.2] * 2]))
+    assert_close(image[:, 1:], torch.full((3, 4, 7), 0.2))
 
 
 def test_read_photo_scales_by_the_largest_value_of_pgm(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import metrics
@@ -81,7 +82,7 @@ def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity():
         metrics.symmetric_rotation_error(est, gt, symmetries), slow, atol=1e-6
     )
     plain = metrics.symmetric_rotation_error(est, gt, torch.empty(0, 3, 3))
-    torch.testing.assert_close(plain, rotation_error(est, gt))
+    assert_close(plain, rotation_error(est, gt))
     assert metrics.symmetric_rotation_error(est[:0], gt[:0], symmetries).shape == (0,)
 
 
@@ -178,13 +179,13 @@ def test_pose_errors_contract(error):
         missing = EST.clone()
         missing[1, 0, 0] = value
         want = torch.where(torch.arange(5) == 1, math.inf, whole)
-        torch.testing.assert_close(error(missing, GT, POINTS), want)
+        assert_close(error(missing, GT, POINTS), want)
     one_by_one = [error(e[None], g[None], POINTS) for e, g in zip(EST, GT, strict=True)]
-    torch.testing.assert_close(torch.cat(one_by_one), whole)
+    assert_close(torch.cat(one_by_one), whole)
     assert error(EST[:0], GT[:0], POINTS).shape == (0,)
     single = error(EST.float(), GT, POINTS)
     assert single.dtype == torch.float32
-    torch.testing.assert_close(single.double(), whole, rtol=1e-3, atol=1e-5)
+    assert_close(single.double(), whole, rtol=1e-3, atol=1e-5)
     # would map every point to the origin, which may be close to the surface
     zero = torch.zeros_like(EST)
     for est, gt, points, message in (

@@ -6,6 +6,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import CurviregWarning
@@ -78,7 +79,7 @@ def test_each_photograph_is_the_first_once_and_relative_poses_are_right(trucks):
         for view in entry.views:
             relative = view.T_cam_from_world
             expected = truths[view.photo] @ torch.linalg.inv(truths[entry.photo])
-            torch.testing.assert_close(relative, expected, atol=1e-3, rtol=0)
+            assert_close(relative, expected, atol=1e-3, rtol=0)
     drawn = [[view.photo for view in entry.views] for entry in benchmark.entries]
     again = BOPBenchmark(trucks, Protocol(pose="any", views=3))
     assert drawn == [[view.photo for view in entry.views] for entry in again.entries]
@@ -102,7 +103,7 @@ def test_poses_of_the_cameras_come_first(trucks):
     truths = [photograph_in_mm(azimuth)[2] for azimuth in (30.0, 70.0, 110.0, 150.0)]
     for view in benchmark.entries[0].views:
         expected = truths[int(view.photo.stem)] @ torch.linalg.inv(truths[0])
-        torch.testing.assert_close(view.T_cam_from_world, expected, atol=1e-3, rtol=0)
+        assert_close(view.T_cam_from_world, expected, atol=1e-3, rtol=0)
 
 
 def sample(image, place=None, instance=0):

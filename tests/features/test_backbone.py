@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from safetensors import safe_open
 from safetensors.torch import load_file
+from torch.testing import assert_close
 
 from curvireg_torch.errors import InvalidInputError, MissingDependencyError, MissingFileError
 from curvireg_torch.features import backbone
@@ -65,9 +66,7 @@ def test_backbone_equals_stored_features_of_timm(network):
     )[None]
     for features, numbers in zip(network(waves), (FINE, COARSE), strict=True):
         H, W = features.shape[-2:]
-        torch.testing.assert_close(
-            features[0, ::9, H // 2, W // 2], torch.tensor(numbers), atol=1e-3, rtol=1e-3
-        )
+        assert_close(features[0, ::9, H // 2, W // 2], torch.tensor(numbers), atol=1e-3, rtol=1e-3)
 
 
 def test_backbone_rejects_a_missing_package_and_a_missing_or_damaged_file(monkeypatch, tmp_path):
@@ -151,8 +150,8 @@ def test_similarity_is_the_mean_cosine_of_the_cells(network):
         expected += torch.einsum("achw,bchw->abhw", cells, cells).mean(dim=(2, 3)) / 2
     d = describe(pictures, network)
     assert (d.dtype, d.shape) == (torch.float16, (3, 40 * 8 * 8 + 112 * 4 * 4))
-    torch.testing.assert_close(similarity(d, d), expected, atol=2e-3, rtol=0)
-    torch.testing.assert_close(similarity(d, d).diagonal(), torch.ones(3), atol=2e-3, rtol=0)
+    assert_close(similarity(d, d), expected, atol=2e-3, rtol=0)
+    assert_close(similarity(d, d).diagonal(), torch.ones(3), atol=2e-3, rtol=0)
 
 
 @pytest.mark.parametrize("channels", [1, 3])

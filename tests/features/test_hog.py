@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch.testing import assert_close
 
 from curvireg_torch import features
 from curvireg_torch.errors import InvalidInputError
@@ -56,7 +57,7 @@ def test_hog_is_invariant_to_sign_and_contrast(factor, dtype):
     field = torch.randn(2, 2, 32, 32, generator=generator, dtype=dtype)
     signs = torch.where(torch.rand(2, 1, 32, 32, generator=generator) < 0.5, -1.0, 1.0)
     field[:, :, 16:] *= 0.01  # weak blocks as well as strong ones
-    torch.testing.assert_close(hog(factor * signs * field), hog(field), rtol=1e-4, atol=1e-6)
+    assert_close(hog(factor * signs * field), hog(field), rtol=1e-4, atol=1e-6)
     assert not hog(torch.zeros_like(field)).any()
 
 
@@ -74,7 +75,7 @@ def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt():
     without = hog(field, bin_weights=torch.tensor([0.0, *[1.0] * 8]))
     assert without.view(2, -1, 9)[..., 0].abs().max() == 0.0
     module = features.HOG(learnable=True)
-    torch.testing.assert_close(module(field), hog(field))
+    assert_close(module(field), hog(field))
     module(field)[:, ::9].sum().backward()
     (logarithms,) = module.parameters()
     assert logarithms.grad is not None
@@ -170,4 +171,4 @@ def test_descriptor_of_a_quarter_turn_is_that_of_the_rotated_field(bins, learnab
     for found, expected in zip(
         layer.with_quarter_turn(field), (layer(field), layer(rotated)), strict=True
     ):
-        torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+        assert_close(found, expected, rtol=0, atol=1e-9)

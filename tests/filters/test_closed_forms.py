@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch import filters
 from tests._support.numbers import double, seeded
@@ -78,7 +79,7 @@ def test_depth_layers_put_the_background_a_quarter_of_the_range_behind_the_objec
         (filters.hessian_frobenius_norm, {}, {"depth_scale": 1.0 / (far - near)}),
         (filters.average_shading_gradient, camera, camera),
     ):  # compare lengths, since signs are arbitrary
-        torch.testing.assert_close(
+        assert_close(
             layer(depth, **options).norm(dim=1), layer(filled, **filled_options).norm(dim=1)
         )
 
@@ -94,7 +95,7 @@ def test_average_shading_gradient_of_a_sphere():
         * ((2.0 + rho2 / (radius**2 - rho2).clamp(min=1.0)) / radius**2).sqrt()
     )
     inside = rho2 < 25.0**2
-    torch.testing.assert_close(field.norm(dim=1)[0][inside], want[inside], rtol=2e-3, atol=0.0)
+    assert_close(field.norm(dim=1)[0][inside], want[inside], rtol=2e-3, atol=0.0)
 
 
 def _camera(focal, size):
@@ -130,22 +131,22 @@ def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_
     want = math.sqrt(math.pi / 3.0) * ((nx * nx).sum(0) + (ny * ny).sum(0)).sqrt()
     inner = (slice(2, -2), slice(2, -2))
     got = filters.average_shading_gradient(depth, sigma=0.0, camera_matrix=camera)[0].norm(dim=0)
-    torch.testing.assert_close(got[inner], want[inner], rtol=5e-3, atol=0.0)
+    assert_close(got[inner], want[inner], rtol=5e-3, atol=0.0)
     q1 = torch.linalg.svdvals(torch.stack([nx, ny], dim=-1).permute(1, 2, 0, 3))[..., 0]
     ridges = filters.apparent_ridges(depth, sigma=0.0, camera_matrix=camera, maxima=False)[0].norm(
         dim=0
     )
-    torch.testing.assert_close(ridges[inner], q1[inner], rtol=5e-3, atol=0.0)
+    assert_close(ridges[inner], q1[inner], rtol=5e-3, atol=0.0)
 
 
 def test_hessian_frobenius_norm_of_a_quadratic():
     x, y = grid(33)
     z = (900.0 + 0.5 * x**2 + 2.0 * x * y - 1.5 * y**2)[None, None]
     field = filters.hessian_frobenius_norm(z, sigma=0.0, depth_scale=1.0)[0, :, 1:-1, 1:-1]
-    torch.testing.assert_close(field.norm(dim=0), torch.full_like(field[0], math.sqrt(1 + 8 + 9)))
+    assert_close(field.norm(dim=0), torch.full_like(field[0], math.sqrt(1 + 8 + 9)))
     values, vectors = torch.linalg.eigh(double([[1.0, 2.0], [2.0, -3.0]]))
     along = vectors[:, values.abs().argmax()]
-    torch.testing.assert_close((field[:, 3, 3] / field[:, 3, 3].norm()).abs(), along.abs())
+    assert_close((field[:, 3, 3] / field[:, 3, 3].norm()).abs(), along.abs())
 
 
 def test_apparent_ridges_of_a_cylinder_and_a_roof():
@@ -158,7 +159,7 @@ def test_apparent_ridges_of_a_cylinder_and_a_roof():
     )[0]
     want = 1.0 / (radius**2 - x**2).sqrt()
     inside = x.abs() < 28
-    torch.testing.assert_close(field.norm(dim=0)[inside], want[inside], rtol=2e-3, atol=0.0)
+    assert_close(field.norm(dim=0)[inside], want[inside], rtol=2e-3, atol=0.0)
     roof = (100.0 + (x - 4).abs() * 0.5)[None, None]
     ridge = (
         filters.apparent_ridges(roof, sigma=1.0, depth_scale=1.0)[0, :, 3:-3, 3:-3].norm(dim=0)
@@ -200,4 +201,4 @@ def test_multiscale_focus_curves_leave_weak_edges_out():
     every = filters.multiscale_focus_curves(image, threshold=0.001)[0, :, 80].norm(dim=0)
     assert [bool(default[i] > 0) for i in (30, 80, 130)] == [True, True, False]
     assert (every[[30, 80, 130]] > 0).all()
-    torch.testing.assert_close(default[[30, 80]], every[[30, 80]])
+    assert_close(default[[30, 80]], every[[30, 80]])

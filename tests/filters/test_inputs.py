@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 import curvireg_torch as cr
 from curvireg_torch import filters
@@ -31,7 +32,7 @@ def test_photo_layers_fill_missing_pixels(layer, value):
     broken.requires_grad_()
     y = layer(broken)
     assert torch.isfinite(y).all()
-    torch.testing.assert_close(y[1], clean[1], rtol=0.0, atol=0.0)
+    assert_close(y[1], clean[1], rtol=0.0, atol=0.0)
     if not layer.name.startswith("diffusion"):
         assert (y[0, :, 5, 7] == missing_value(layer)).all()
     # Beyond the reach of the kernels only normalisations by the maximum of the image can change.
@@ -79,12 +80,12 @@ def test_a_padded_batch_gives_what_each_photograph_alone_gives(layer, corner):
     part = found[:1, :, top : top + 40, left : left + 40]
     # diffusion goes on in what lies outside
     tolerance = 0.01 if layer.name.startswith("diffusion") else 1e-12
-    torch.testing.assert_close(part, want, rtol=0.0, atol=tolerance * float(want.abs().max()))
-    torch.testing.assert_close(found[1:], layer(other))
+    assert_close(part, want, rtol=0.0, atol=tolerance * float(want.abs().max()))
+    assert_close(found[1:], layer(other))
     # in a graph, whose sizes cannot depend on pixels, it is as if the border were replicated
     traced = torch.func.vmap(layer)(torch.cat([padded, other])[None])[0]
     if layer.name in ("ig", "ics", "pci"):
-        torch.testing.assert_close(traced, found)
+        assert_close(traced, found)
 
 
 @pytest.mark.parametrize("unit", ["0 to 255", "normalised"])
@@ -101,9 +102,7 @@ def test_images_in_another_unit_give_the_same_field_or_a_warning(layer, unit):
     other = layer(scaled)
     factor = float((field * other).sum() / (field * field).sum())
     assert factor > 0.0
-    torch.testing.assert_close(
-        other, factor * field, rtol=1e-3, atol=1e-3 * float(other.abs().max())
-    )
+    assert_close(other, factor * field, rtol=1e-3, atol=1e-3 * float(other.abs().max()))
 
 
 def test_the_learned_field_warns_of_images_in_another_unit():
@@ -131,12 +130,12 @@ def test_gradient_penalties_are_finite_where_images_are_flat(layer, dtype):
 def test_photo_layers_convert_colour_to_grey(layer):
     colour = colour_photos(2, dtype=torch.float64)
     weights = torch.tensor([0.299, 0.587, 0.114], dtype=torch.float64).view(1, 3, 1, 1)
-    torch.testing.assert_close(to_grey(colour), (weights * colour).sum(dim=1, keepdim=True))
+    assert_close(to_grey(colour), (weights * colour).sum(dim=1, keepdim=True))
     if layer.name.startswith("diffusion"):
         assert layer(colour).shape == colour.shape  # channels are independent
-        torch.testing.assert_close(layer(colour)[:, 1:2], layer(colour[:, 1:2]))
+        assert_close(layer(colour)[:, 1:2], layer(colour[:, 1:2]))
     else:
-        torch.testing.assert_close(layer(colour), layer(to_grey(colour)), rtol=0.0, atol=0.0)
+        assert_close(layer(colour), layer(to_grey(colour)), rtol=0.0, atol=0.0)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -147,5 +146,5 @@ def test_hog_and_field_points_ignore_vectors_that_are_not_finite(value):
     zero[0, :, 9, 12:15] = 0.0
     broken[0, :, 9, 12:15] = zero[0, :, 9, 12:15]
     broken[0, 1, 9, 12:15] = value
-    torch.testing.assert_close(hog(broken), hog(zero), rtol=0.0, atol=0.0)
+    assert_close(hog(broken), hog(zero), rtol=0.0, atol=0.0)
     assert torch.equal(field_points(broken), field_points(zero))

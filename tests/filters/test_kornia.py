@@ -6,6 +6,7 @@ import kornia
 import pytest
 import torch
 from kornia.filters import spatial_gradient
+from torch.testing import assert_close
 
 from curvireg_torch import filters
 from curvireg_torch.filters import operations as ops
@@ -68,7 +69,7 @@ def test_both_give_the_same_with_the_same_derivatives(name, shape, dtype):
         found.append((y.detach(), slope))
     assert found[0][0].shape == found[1][0].shape
     tolerance = 2e-6 if dtype == torch.float32 else 1e-12
-    torch.testing.assert_close(found[1], found[0], rtol=tolerance, atol=tolerance)
+    assert_close(found[1], found[0], rtol=tolerance, atol=tolerance)
 
 
 @pytest.mark.parametrize("name", list(LAYERS))
@@ -110,7 +111,7 @@ def test_filters_call_kornia_and_graphs_do_not(monkeypatch):
     assert not calls
     torch._dynamo.reset()
     graph = torch.compile(filters.image_gradient, fullgraph=True, backend="eager")
-    torch.testing.assert_close(graph(x), field)
+    assert_close(graph(x), field)
     assert not calls
 
 
@@ -121,11 +122,11 @@ def test_kornia_is_not_called_where_gradients_are_wanted(monkeypatch):
     field = filters.image_gradient(x)
     learnable = filters.ImageGradient(learnable=True)
     calls.clear()
-    torch.testing.assert_close(filters.image_gradient(x.clone().requires_grad_()), field)
-    torch.testing.assert_close(learnable(x), field)
+    assert_close(filters.image_gradient(x.clone().requires_grad_()), field)
+    assert_close(learnable(x), field)
     assert not calls
     with torch.no_grad():
-        torch.testing.assert_close(learnable(x), field)
+        assert_close(learnable(x), field)
     assert calls == ["gaussian_blur2d"]
 
 
@@ -135,5 +136,5 @@ def test_grey_levels_are_those_of_kornia_in_graphs_too():
     assert ops.to_grey(x[:, :1]) is not None
     torch._dynamo.reset()
     graph = torch.compile(ops.to_grey, fullgraph=True, backend="eager")
-    torch.testing.assert_close(graph(x), ops.to_grey(x))
-    torch.testing.assert_close(torch.func.vmap(ops.to_grey)(x[None]), ops.to_grey(x)[None])
+    assert_close(graph(x), ops.to_grey(x))
+    assert_close(torch.func.vmap(ops.to_grey)(x[None]), ops.to_grey(x)[None])

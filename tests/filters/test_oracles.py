@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 from skimage.feature import hessian_matrix_eigvals
+from torch.testing import assert_close
 
 from curvireg_torch import filters
 from curvireg_torch.filters.curvilinear import dominant_eigenvector, scaled_direction
@@ -161,12 +162,12 @@ def test_dominant_eigenvector_against_lapack():
     vx, vy, half_gap = dominant_eigenvector(*planes)
     v = torch.cat(scaled_direction(torch.ones_like(vx), vx, vy), dim=1)[:, :, 0, 0]
     values = torch.linalg.eigvals(m).real
-    torch.testing.assert_close(2 * half_gap.flatten(), values.amax(dim=1) - values.amin(dim=1))
-    torch.testing.assert_close(v.norm(dim=1), torch.ones(len(m), dtype=torch.float64))
+    assert_close(2 * half_gap.flatten(), values.amax(dim=1) - values.amin(dim=1))
+    assert_close(v.norm(dim=1), torch.ones(len(m), dtype=torch.float64))
     rayleigh = (m @ v[:, :, None])[:, :, 0]
     value = (rayleigh * v).sum(dim=1)
-    torch.testing.assert_close(rayleigh, value[:, None] * v, atol=1e-12, rtol=1e-9)
-    torch.testing.assert_close(value.abs(), values.abs().amax(dim=1))
+    assert_close(rayleigh, value[:, None] * v, atol=1e-12, rtol=1e-9)
+    assert_close(value.abs(), values.abs().amax(dim=1))
 
 
 @pytest.mark.parametrize("formula", ["geometric", "paper", "paper-length"])
@@ -189,7 +190,7 @@ def test_direction_of_depth_curvilinear_saliency_against_lapack(formula):
     squared = zx**2 + zy**2
     factor = (1 + squared) ** -1.5 if formula == "geometric" else squared.sqrt()
     want = factor * (values.amax(dim=-1) - values.amin(dim=-1))
-    torch.testing.assert_close(field.norm(dim=0), want, atol=1e-9, rtol=1e-7)
+    assert_close(field.norm(dim=0), want, atol=1e-9, rtol=1e-7)
     clear = (key[..., 0] - key[..., 1]).abs() > 1e-6 * values.abs().amax(dim=-1)
     across = field[0] * v[..., 1] - field[1] * v[..., 0]
     assert across[clear].abs().max() < 1e-7 * float(want.max())

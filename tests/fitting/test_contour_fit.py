@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import torch.nn.functional as F
+from torch.testing import assert_close
 
 from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
@@ -80,16 +81,14 @@ def test_edges_are_measured_to_a_fraction_of_a_pixel(side):
     measured = problem(at(9, 1.2 * side, -2.0 * side), [0.5, 0.6]).measured_edges(
         state(9, valid=7), 4.0
     )
-    torch.testing.assert_close(
-        measured.distance[0, :7, 0], torch.full((7,), 1.2 * side, dtype=torch.float64)
-    )
+    assert_close(measured.distance[0, :7, 0], torch.full((7,), 1.2 * side, dtype=torch.float64))
     strength = 0.5 * (1.0 - (0.2 / 1.5) ** 2)  # at the nearest whole pixel
     tukey = (1.0 - (1.2 / 4.0) ** 2) ** 2
     assert measured.weight[0, :, 0].tolist() == pytest.approx([strength * tukey] * 7 + [0.0] * 2)
 
 
 def test_edge_support_is_the_mean_strength_near_valid_points():
-    half = torch.tensor([[0.0, 50.0] * 4]).double()
+    half = double([[0.0, 50.0] * 4])
     beside = 0.7 * (1 - 1 / 2.25) * math.exp(-2.0)
     cases = (at(8, 0.0), 4, 0.7), (at(8, -3.0), 4, beside), (half, 4, 0.35), (half, 0, 0.0)
     for distances, valid, expected in cases:
@@ -108,7 +107,7 @@ def test_step_undoes_a_motion_despite_stronger_wrong_edges():
     sides = torch.where(torch.arange(120) % 2 == 0, 4.0, -4.0)
     wrong = torch.where(torch.arange(120) % 3 == 0, distance + sides, 90.0)
     found = twist_of(problem(torch.cat([distance, wrong]), [0.5, 0.6]), points, 6.0)
-    torch.testing.assert_close(found, motion, rtol=0.03, atol=2e-4)
+    assert_close(found, motion, rtol=0.03, atol=2e-4)
 
 
 def test_edge_strength_peaks_on_a_slanted_edge():
@@ -132,11 +131,11 @@ def test_edge_strength_falls_with_the_fifth_power_of_the_cosine_in_the_strongest
     ramp = sign * torch.tensor([0.004, 0.01, -0.005])[:, None, None] * (0.8 * x + 0.6 * y)
     angles = math.atan2(0.6, 0.8) + double([0.0, 0.3, -0.6, 1.0, math.pi / 2, math.pi])
     n = torch.stack([angles.cos(), angles.sin()], dim=-1)[None]
-    here = torch.tensor([31.5, 30.2]).double().expand(1, 6, 2)
+    here = double([31.5, 30.2]).expand(1, 6, 2)
     strength = EdgeField(ramp[None]).strength(here, n, torch.zeros(1), FIRST)[0, :, 0].double()
     r = strength / (1.0 - strength)  # in units of the crop's root mean square gradient
     cosine = (angles - angles[0]).cos().abs()
-    torch.testing.assert_close(r / r[0], cosine**5, rtol=1e-3, atol=1e-4)
+    assert_close(r / r[0], cosine**5, rtol=1e-3, atol=1e-4)
 
 
 def test_edges_outside_the_photograph_do_not_count():
@@ -218,7 +217,7 @@ def test_mask_weights_steps_and_comparison_and_not_the_reported_support():
     points = state(120)
     steps = [float(twist_of(one, points.points, 6.0).norm()) for one in (plain, weighted)]
     assert steps[1] < 0.2 * steps[0]
-    torch.testing.assert_close(
+    assert_close(
         weighted.measured_edges(points, 4.0).weight, plain.measured_edges(points, 4.0).weight
     )
     assert float(weighted.edge_support(points)) == float(plain.edge_support(points))
@@ -250,7 +249,7 @@ def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
     R = fit.transform[0, :3, :3]
     assert rotation_error(R, truth[:3, :3]) < 0.6
     assert ((fit.transform[0, :3, 3] - truth[:3, 3]).norm() / truth[:3, 3].norm()) < 0.01
-    torch.testing.assert_close(R @ R.T, eye(3))
+    assert_close(R @ R.T, eye(3))
     C = fit.covariance[0]
     assert torch.linalg.eigvalsh(C).min() > 0
     assert 0.001 < torch.rad2deg(C.diagonal()[:3].sqrt()).max() < 5.0
@@ -337,9 +336,7 @@ def test_fits_of_a_batch_equal_single_fits():
             "covariance": 0.02 * alone.covariance.max(),
         }
         for name, atol in tolerances.items():
-            torch.testing.assert_close(
-                getattr(fit, name)[i], getattr(alone, name)[0], rtol=0, atol=atol
-            )
+            assert_close(getattr(fit, name)[i], getattr(alone, name)[0], rtol=0, atol=atol)
 
 
 def test_fit_finishes_the_best_starts_of_each_photograph():
@@ -356,7 +353,7 @@ def test_fit_finishes_the_best_starts_of_each_photograph():
     assert torch.bincount(index[same], minlength=3).tolist() == [1, 1, 1]
     for b in range(3):
         best = whole.edge_support[index == b].max()
-        torch.testing.assert_close(one.edge_support[index == b].max(), best, rtol=0, atol=1e-4)
+        assert_close(one.edge_support[index == b].max(), best, rtol=0, atol=1e-4)
 
 
 def test_start_support_is_at_full_size_and_trustworthy_depends_on_support_or_gain():
@@ -367,7 +364,7 @@ def test_start_support_is_at_full_size_and_trustworthy_depends_on_support_or_gai
         MeshContours(cube()), EdgeCrops.cut([image], BOX[None], 0.1), K[None], start, FIRST
     )
     fit = fitted(image, start)
-    torch.testing.assert_close(fit.start_support, expected)
+    assert_close(fit.start_support, expected)
     assert fit.trustworthy
     assert not fitted(noise(), start).trustworthy
     none = torch.zeros(4)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import trimesh
+from torch.testing import assert_close
 
 from curvireg_torch.fitting import details
 from curvireg_torch.fitting.edges import EdgeCrops, EdgeField
@@ -35,7 +36,7 @@ def compared(*, shift=0.0, unit=1.0, wrong=0.0):
     mesh = marked_box(unit)
     radius = mesh_radius(mesh)
     R = rotation_from_viewpoint(35.0, 30.0, 0.0).double()
-    T = transform(R, radius * torch.tensor([shift, 0.0, 5.0]).double())
+    T = transform(R, radius * double([shift, 0.0, 5.0]))
     image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(1))
     crops = EdgeCrops.cut([image], box[None], 0.1)
     again = T.clone()
@@ -51,7 +52,7 @@ def test_contours_that_are_in_the_photograph_speak_for_their_pose(unit):
     scores, differ = compared(unit=unit)
     assert differ.tolist() == [[False, True, False], [True, False, True], [False, True, False]]
     assert float(scores[0, 1]) > 0.5
-    torch.testing.assert_close(scores, -scores.T)
+    assert_close(scores, -scores.T)
     assert float(scores[0, 2]) == 0.0
 
 
@@ -116,7 +117,7 @@ def closed_case(
     ``outside`` the photograph ends."""
     rows = [[*some, *more] for some, more in zip(places, padding or [[], []], strict=True)]
     P = max(map(len, rows))
-    x = torch.tensor([row + [900.0] * (P - len(row)) for row in rows]).double()
+    x = double([row + [900.0] * (P - len(row)) for row in rows])
     valid = torch.tensor([[k < len(some) for k in range(P)] for some in places])
     uv = torch.stack([x, torch.zeros_like(x)], dim=-1)
     points = SimpleNamespace(model=None, normals=None, valid=valid)
@@ -132,7 +133,7 @@ def closed_case(
     nothing = None
     T = eye(4).repeat(2, 1, 1)
     scores, differ = details.compare_details(nothing, nothing, nothing, T, nothing)
-    torch.testing.assert_close(scores, -scores.T)
+    assert_close(scores, -scores.T)
     assert torch.equal(differ, differ.T)
     return float(scores[0, 1]), bool(differ[0, 1])
 
@@ -204,7 +205,7 @@ def test_pairs_of_many_photographs_are_compared_as_each_alone():
     found, looks_different = details.compare_pairs(table, first, second)
     assert differ[first, second].all()
     assert torch.equal(looks_different, differ[first, second])
-    torch.testing.assert_close(found, scores[first, second])
+    assert_close(found, scores[first, second])
     # by hand, of the first pair
     gains = []
     counts = []

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch import camera_matrix
 from curvireg_torch.fitting import focal_length
@@ -54,7 +55,7 @@ def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
     before, after = (
         projected(centre[None], pose, K)[0] for pose, K in ((T, NEAR[None]), (moved, longer))
     )
-    torch.testing.assert_close(before, after)
+    assert_close(before, after)
     turn = focal_length._motion_with_focal_length(T, centre)[0, :3] * 0.01
     assert rotation_error(moved[0, :3, :3], T[0, :3, :3]) == pytest.approx(
         float(torch.rad2deg(turn.norm())), rel=0.02
@@ -64,9 +65,7 @@ def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
 def test_derivative_by_the_focal_length():
     image, box, T = near_scene()
     problem = fitting_problem(image, box, NEAR)
-    T = apply_twist(
-        T[None], torch.tensor([[0.05, 0.1, 0.0, 0.02, 0.0, 0.0]]).double(), problem.centre
-    )
+    T = apply_twist(T[None], double([[0.05, 0.1, 0.0, 0.02, 0.0, 0.0]]), problem.centre)
     state = problem.state(T)
     step = double([1e-5])
 
@@ -79,16 +78,16 @@ def test_derivative_by_the_focal_length():
     uv, J = project(state.points.model, state.points.normals, T, problem.K, problem.centre)
     valid = state.points.valid
     found = focal_length._by_focal_length(problem, state, uv, J)
-    torch.testing.assert_close(found[valid], numeric[valid], atol=1e-4, rtol=1e-4)
+    assert_close(found[valid], numeric[valid], atol=1e-4, rtol=1e-4)
     assert found[valid].abs().max() > 1.0
 
 
 @pytest.mark.parametrize("wrong", [0.75, 1.35])
 def test_strong_perspective_shows_the_focal_length(wrong):
     image, box, T = near_scene()
-    guess = focal_length.scaled_cameras(NEAR[None], torch.tensor([wrong]).double().log())[0]
+    guess = focal_length.scaled_cameras(NEAR[None], double([wrong]).log())[0]
     problem = fitting_problem(image, box, guess)
-    start = focal_length.moved_away(T[None], torch.tensor([wrong]).double().log(), problem.centre)
+    start = focal_length.moved_away(T[None], double([wrong]).log(), problem.centre)
     fit = focal_length.fit_focal_length(
         problem, start, focal_length.FocalPrior.usual(guess[None], SIZE), FULL_SIZE_RADII
     )
@@ -107,7 +106,7 @@ def test_strong_perspective_shows_the_focal_length(wrong):
 )
 def test_a_narrow_prior_or_a_limit_holds_the_focal_length(deviation, limit, is_moved, expected):
     image, box, T = near_scene()
-    wrong = torch.tensor([1.35]).double().log()
+    wrong = double([1.35]).log()
     problem = fitting_problem(image, box, focal_length.scaled_cameras(NEAR[None], wrong)[0])
     none = torch.zeros(1, dtype=torch.float64)
     prior = focal_length.FocalPrior(none, deviation, none - limit, none + limit)

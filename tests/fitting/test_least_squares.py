@@ -7,6 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 import trimesh
+from torch.testing import assert_close
 
 from curvireg_torch.calibration import COVARIANCE_SCALE
 from curvireg_torch.fitting import least_squares as ls
@@ -35,9 +36,9 @@ def test_project_and_its_derivative():
         moved, torch.full((6,), 1e-7, dtype=torch.float64)
     )
     uv, derivative = ls.project(points, normals, T, K[None], centre)
-    torch.testing.assert_close(uv[0], project_points(points[0], T[0], K))
-    torch.testing.assert_close(ls.pixels(points, T, K[None], centre), uv)
-    torch.testing.assert_close(derivative[0], expected, rtol=1e-4, atol=1e-3)
+    assert_close(uv[0], project_points(points[0], T[0], K))
+    assert_close(ls.pixels(points, T, K[None], centre), uv)
+    assert_close(derivative[0], expected, rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -55,15 +56,13 @@ def test_long_steps_are_shortened(rotation, translation, fraction):
     centre = double([0.0, 0.0, 0.5])
     step = double([[*rotation, *(6.5 * t for t in translation)]])
     A = eye(6)[None]
-    torch.testing.assert_close(
-        ls.least_squares_step(A, step[..., None], T, centre, 0.0), fraction * step
-    )
+    assert_close(ls.least_squares_step(A, step[..., None], T, centre, 0.0), fraction * step)
 
 
 def test_damping_shortens_each_direction_alike():
     A = torch.diag(double([1.0, 100.0, 1e4, 1.0, 1.0, 1.0]))[None]
     x = ls.damped_solution(A, A @ torch.ones(1, 6, 1, dtype=torch.float64), 0.25)
-    torch.testing.assert_close(x, torch.full((1, 6), 0.8, dtype=torch.float64))
+    assert_close(x, torch.full((1, 6), 0.8, dtype=torch.float64))
     assert ls.damped_solution(0 * A, torch.zeros(1, 6, 1).double(), 0.01).tolist() == [[0.0] * 6]
 
 
@@ -75,7 +74,7 @@ def test_points_need_a_minimum_of_matches():
     for count, expected in ((ls.MIN_MATCHES - 1, T), (ls.MIN_MATCHES, truth)):
         weight = (torch.arange(20) < count).double()[None]
         found = ls.fit_points(ls.PointMatches(points, uv, weight), T, K[None], ZERO, [8.0] * 8)
-        torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+        assert_close(found, expected, rtol=0, atol=1e-6)
 
 
 def test_inlier_ratio_counts_all_points():
@@ -100,22 +99,22 @@ def test_matches_are_measured_along_x_and_y_of_the_image():
     matches = ls.PointMatches(points, uv, weight)
     found = matches.measurements(T, K[None], ZERO, 2.0)
     expected = double([0.5, 0.0, 0.0, 0.0, 0.0, 1.0])
-    torch.testing.assert_close(found.distance.flatten(), expected)
-    robust = torch.tensor([(1 + 1 / 16) ** -2, 0.5, (1 + 1 / 4) ** -2]).double()
-    torch.testing.assert_close(found.weight.flatten(), robust.repeat_interleave(2))
+    assert_close(found.distance.flatten(), expected)
+    robust = double([(1 + 1 / 16) ** -2, 0.5, (1 + 1 / 4) ** -2])
+    assert_close(found.weight.flatten(), robust.repeat_interleave(2))
     scaled = matches.scaled(0.3).measurements(T, K[None], ZERO, 2.0)
-    torch.testing.assert_close(scaled.weight, 0.3 * found.weight)
+    assert_close(scaled.weight, 0.3 * found.weight)
     for row, axis in ((2, (1.0, 0.0)), (3, (0.0, 1.0))):
-        normal = torch.tensor(axis).double().expand(1, 1, 2)
+        normal = double(axis).expand(1, 1, 2)
         _, J = ls.project(points[:, 1:2], normal, T, K[None], ZERO)
-        torch.testing.assert_close(found.J[:, row], J[:, 0])
+        assert_close(found.J[:, row], J[:, 0])
 
 
 def test_nearest_rigid_pose_is_orthogonal():
     T = pose([0.3, -0.2, 0.5], [1.0, 2.0, 3.0])[None]
     drifted = T.clone()
     drifted[:, :3, :3] *= 1.001
-    torch.testing.assert_close(ls.nearest_rigid(drifted), T)
+    assert_close(ls.nearest_rigid(drifted), T)
 
 
 def cloud(count):
@@ -161,7 +160,7 @@ def test_covariance_in_closed_form():
         g = (w * r * rows)[(cells == cell).all(dim=1)].sum(dim=0)
         B += g[:, None] * g
     inverse = torch.linalg.inv(rows.T @ (w * rows))
-    torch.testing.assert_close(C[0], COVARIANCE_SCALE * inverse @ B @ inverse, rtol=1e-3, atol=1e-9)
+    assert_close(C[0], COVARIANCE_SCALE * inverse @ B @ inverse, rtol=1e-3, atol=1e-9)
 
 
 @pytest.mark.parametrize(("factor", "known"), [(0.95, False), (1.05, True)])
@@ -211,7 +210,7 @@ def test_covariance_follows_the_unit_of_the_mesh(unit, across):
     )
     assert int(directions) == int(known) == (6 if not across else int(known))
     assert int(known) < 6 or not across
-    torch.testing.assert_close(found / S[:, None] / S, C, rtol=1e-4, atol=1e-9)
+    assert_close(found / S[:, None] / S, C, rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize(("radius", "expected"), [(1.0, 6), (6.0, 6), (8.0, 4)])

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 from curvireg_torch import geometry as g
 from curvireg_torch.geometry.cameras import point_in_cameras, pose_around
@@ -61,10 +62,10 @@ def test_pose_from_box_keeps_the_object_in_front_of_the_camera():
 
 def test_a_pose_around_a_point_has_it_at_the_place():
     R = g.rotation_from_viewpoint(double([30.0, 80.0]), 20.0, 5.0)
-    point = torch.tensor([0.3, -0.2, 0.5]).double()
-    places = torch.tensor([[0.1, 0.2, 3.0], [-0.4, 0.0, 5.0]]).double()
+    point = double([0.3, -0.2, 0.5])
+    places = double([[0.1, 0.2, 3.0], [-0.4, 0.0, 5.0]])
     T = pose_around(R, places, point)
-    torch.testing.assert_close(point_in_cameras(T, point), places)
-    torch.testing.assert_close(point_in_cameras(T[1], point), places[1])
+    assert_close(point_in_cameras(T, point), places)
+    assert_close(point_in_cameras(T[1], point), places[1])
     homogeneous = torch.cat([point, torch.ones(1).double()])
-    torch.testing.assert_close((T @ homogeneous)[:, :3], places)
+    assert_close((T @ homogeneous)[:, :3], places)

@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
@@ -20,7 +21,7 @@ def test_image_transforms_invert_crop_transforms_with_exact_zeros():
     # A camera matrix with 1e-16 in place of 0, which some versions of LAPACK leave, is refused.
     squares = double([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]])
     back = image_transforms(squares, 32)
-    torch.testing.assert_close(back @ g.crop_transforms(squares, 32), eye(3).expand(2, 3, 3))
+    assert_close(back @ g.crop_transforms(squares, 32), eye(3).expand(2, 3, 3))
     check_camera_matrix(back)
 
 
@@ -35,7 +36,7 @@ def test_crop_images_agrees_with_its_transforms_on_a_ramp(side, size, off):
     y, x = torch.meshgrid(torch.arange(float(size)), torch.arange(float(size)), indexing="ij")
     source = torch.stack([x.flatten(), y.flatten(), torch.ones(size * size)]).double()
     expected = (torch.linalg.inv(A[0].double()) @ source)[:2].view(2, size, size)
-    torch.testing.assert_close(crops[0].double(), expected, rtol=0, atol=off)
+    assert_close(crops[0].double(), expected, rtol=0, atol=off)
 
 
 @pytest.mark.parametrize("side", [3.0, 9.5, 40.0, 200.0])
@@ -53,7 +54,7 @@ def test_crop_squares_are_triangle_filtered(side):
         return w / w.sum(dim=1, keepdim=True)
 
     for crop, (x0, y0, x1, y1) in zip(crops, squares.tolist(), strict=True):
-        torch.testing.assert_close(crop, weights(y0, y1, 70) @ image @ weights(x0, x1, 90).mT)
+        assert_close(crop, weights(y0, y1, 70) @ image @ weights(x0, x1, 90).mT)
 
 
 def test_check_boxes_refuses_boxes_without_pixels():
@@ -90,6 +91,6 @@ def test_crop_images_spreads_missing_pixels_no_further_than_its_filter():
     assert 1 <= int(lost.sum()) == int(lost[0, 1].sum()) <= 9
     assert (columns - at[0]).abs().max() < 2.0
     assert (rows - at[1]).abs().max() < 2.0
-    torch.testing.assert_close(crop[~lost], clean[~lost], rtol=0, atol=0)
+    assert_close(crop[~lost], clean[~lost], rtol=0, atol=0)
     crops, _ = g.crop_images(torch.cat([inside, image]), boxes.expand(2, 4), size=32)
-    torch.testing.assert_close(crops[1], clean[0])
+    assert_close(crops[1], clean[0])

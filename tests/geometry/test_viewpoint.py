@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 import curvireg_torch as cr
 from curvireg_torch import geometry as g
@@ -35,18 +36,18 @@ def test_rotations_have_the_type_of_the_tensors_and_of_numbers_alone_float64(ang
     R = g.rotation_from_viewpoint(*angles)
     assert R.dtype == dtype
     exact = g.rotation_from_viewpoint(*map(float, angles))
-    torch.testing.assert_close(R.double(), exact, rtol=0, atol=4 * torch.finfo(dtype).eps)
+    assert_close(R.double(), exact, rtol=0, atol=4 * torch.finfo(dtype).eps)
 
 
 def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint():
     R = torch.from_numpy(Rotation.random(500, random_state=0).as_matrix())
     a, e, t = g.viewpoint_from_rotation(R)
     assert ((a >= 0) & (a < 360) & (e.abs() <= 90) & (t >= -180) & (t < 180)).all()
-    torch.testing.assert_close(g.rotation_from_viewpoint(a, e, t), R, rtol=0, atol=1e-12)
+    assert_close(g.rotation_from_viewpoint(a, e, t), R, rtol=0, atol=1e-12)
     R = g.rotation_from_viewpoint(torch.tensor([-1e-9, 720.0]), 0.0, torch.tensor([180.0, -180.0]))
     a, _, t = g.viewpoint_from_rotation(R)
     assert ((a < 360) & (t < 180)).all(), "angles are wrapped"
-    torch.testing.assert_close(t.abs(), torch.full_like(t, 180.0), rtol=0, atol=1e-4)
+    assert_close(t.abs(), torch.full_like(t, 180.0), rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("elevation", [90.0, -90.0])
@@ -73,11 +74,11 @@ def test_angles_of_all_pairs_are_those_of_the_nearest_symmetry():
     others = torch.from_numpy(Rotation.random(7, random_state=2).as_matrix())
     group = torch.from_numpy(Rotation.create_group("C4").as_matrix())
     plain = rotation_error(R[:, None], others[None])
-    torch.testing.assert_close(angles_between(R, others), plain)
+    assert_close(angles_between(R, others), plain)
     nearest = rotation_error(R[:, None, None] @ group, others[None, :, None]).amin(dim=2)
-    torch.testing.assert_close(angles_between(R, others, group), nearest)
+    assert_close(angles_between(R, others, group), nearest)
     transforms = g.transform(group, torch.ones(4, 3).double())
-    torch.testing.assert_close(angles_between(R, others, transforms), nearest)
+    assert_close(angles_between(R, others, transforms), nearest)
 
 
 def test_rotation_error_agrees_with_scipy():
@@ -88,9 +89,9 @@ def test_rotation_error_agrees_with_scipy():
     B = A * differences
     ours = g.rotation_error(torch.from_numpy(A.as_matrix()), torch.from_numpy(B.as_matrix()))
     expected = torch.rad2deg(torch.from_numpy((A.inv() * B).magnitude()))
-    torch.testing.assert_close(ours, expected, rtol=0, atol=1e-5)
+    assert_close(ours, expected, rtol=0, atol=1e-5)
     small = ours[expected < 1e-6]
-    torch.testing.assert_close(small, expected[expected < 1e-6], rtol=0.02, atol=1e-12)
+    assert_close(small, expected[expected < 1e-6], rtol=0.02, atol=1e-12)
     assert g.rotation_error(
         torch.eye(3).expand(4, 1, 3, 3), torch.eye(3).expand(5, 3, 3)
     ).shape == (4, 5)
@@ -148,4 +149,4 @@ def test_for_up_shows_the_same_views(up):
     )
     views = cr.sample_views(azimuth_step=40, elevations=[-20, 30, 90], thetas=[0, 25])
     seen = views.for_up(up).rotations.double() @ up_rotation(up).T
-    torch.testing.assert_close(seen, views.rotations.double(), rtol=0, atol=2e-6)
+    assert_close(seen, views.rotations.double(), rtol=0, atol=2e-6)

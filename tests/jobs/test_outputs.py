@@ -6,8 +6,8 @@ import os
 
 import pytest
 
-from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.jobs.outputs import FILES, MARKER, check_output_file, output_folder
+from tests._support.refusals import refused
 
 
 def marked(folder):
@@ -21,9 +21,7 @@ def test_files_of_others_are_refused_and_named(tmp_path, command, name):
     file = tmp_path / name.replace("*", "1")
     file.write_text("of others")
     with (
-        pytest.raises(
-            InvalidInputError, match=rf"{file.name}: not written by this command; move it away"
-        ),
+        refused(rf"{file.name}: not written by this command; move it away"),
         output_folder(tmp_path, command),
     ):
         pytest.fail("work began")
@@ -39,7 +37,7 @@ def test_own_files_are_replaced_and_others_beside_them_do_not_matter(tmp_path):
     assert marked(tmp_path) == {"register": {"files": ["result.json"], "source": []}}
     (tmp_path / "pose.glb").write_text("a mesh that came later")
     with (
-        pytest.raises(InvalidInputError, match=r"pose\.glb: not written"),
+        refused(r"pose\.glb: not written"),
         output_folder(tmp_path, "register"),
     ):
         pytest.fail("work began")
@@ -71,7 +69,7 @@ def test_of_two_runs_at_a_time_the_second_is_refused(tmp_path, source):
     with output_folder(tmp_path, "register several", source=["a.csv"]):
         marker = (tmp_path / MARKER).read_bytes()
         second = output_folder(tmp_path, "register several", source=source)
-        with pytest.raises(InvalidInputError, match="another run is writing its results here"):
+        with refused("another run is writing its results here"):
             second.__enter__()
         assert (tmp_path / MARKER).read_bytes() == marker
     with output_folder(tmp_path, "register several", source=source):
@@ -82,7 +80,7 @@ def test_a_run_of_another_source_that_was_stopped_is_not_taken_over(tmp_path):
     """Even before it has a result: who started it resumes it."""
     killed(tmp_path, "register several", None, source=["a.csv"])
     marker = (tmp_path / MARKER).read_bytes()
-    with pytest.raises(InvalidInputError, match=r"a run of a\.csv was stopped here"):
+    with refused(r"a run of a\.csv was stopped here"):
         output_folder(tmp_path, "register several", source=["b.csv"]).__enter__()
     assert (tmp_path / MARKER).read_bytes() == marker
     with output_folder(tmp_path, "register several", source=["a.csv"]):
@@ -124,12 +122,12 @@ PAIRS = [
 def test_files_of_another_command_are_refused(tmp_path, first, name, second):
     with output_folder(tmp_path, first):
         (tmp_path / name).write_text("")
-    with pytest.raises(InvalidInputError, match=rf"{name}: a result of 'curvireg {first}'"):
+    with refused(rf"{name}: a result of 'curvireg {first}'"):
         output_folder(tmp_path, second).__enter__()
     (tmp_path / name).unlink()
     with output_folder(tmp_path, second):
         (tmp_path / name).write_text("")
-    with pytest.raises(InvalidInputError, match=f"a result of 'curvireg {second}'"):
+    with refused(f"a result of 'curvireg {second}'"):
         output_folder(tmp_path, first).__enter__()
 
 
@@ -146,14 +144,14 @@ def test_inputs_are_refused_under_any_name(tmp_path):
         tmp_path / "start.json",
         tmp_path / "link.json",
     ):
-        with pytest.raises(InvalidInputError, match=rf"{path.name}: an input of this command"):
+        with refused(rf"{path.name}: an input of this command"):
             output_folder(out, "register", inputs=[tmp_path / "none", path]).__enter__()
 
 
 def test_results_of_another_source_would_be_lost(tmp_path):
     with output_folder(tmp_path, "register several", source=["a.jpg", "b.jpg"]):
         (tmp_path / "results.csv").write_text("")
-    with pytest.raises(InvalidInputError, match=r"holds results of b\.jpg, which would be lost"):
+    with refused(r"holds results of b\.jpg, which would be lost"):
         output_folder(tmp_path, "register several", source=["a.jpg", "c.jpg"]).__enter__()
     with output_folder(tmp_path, "register several"):
         pass
@@ -170,7 +168,7 @@ def test_results_of_another_source_would_be_lost(tmp_path):
 )
 def test_damaged_markers_are_refused(tmp_path, content):
     (tmp_path / MARKER).write_text(content)
-    with pytest.raises(InvalidInputError, match=rf"{MARKER}: "):
+    with refused(rf"{MARKER}: "):
         output_folder(tmp_path, "register").__enter__()
 
 
@@ -178,11 +176,9 @@ def test_files_that_are_named_are_replaced_only_with_our_mark(tmp_path):
     file = tmp_path / "new" / "overlay.png"
     check_output_file(file, [], mark=b"curvireg")
     file.write_bytes(b"a picture")
-    with pytest.raises(
-        InvalidInputError, match=r"overlay\.png: exists, and this command did not write it"
-    ):
+    with refused(r"overlay\.png: exists, and this command did not write it"):
         check_output_file(file, [], mark=b"curvireg")
     file.write_bytes(b"a picture by curvireg")
     check_output_file(file, [], mark=b"curvireg")
-    with pytest.raises(InvalidInputError, match=r"overlay\.png: an input"):
+    with refused(r"overlay\.png: an input"):
         check_output_file(file, [file], mark=b"curvireg")

@@ -3,8 +3,9 @@ from unittest.mock import Mock
 
 import pytest
 
-from curvireg_torch.errors import InvalidInputError, OutputError
+from curvireg_torch.errors import OutputError
 from curvireg_torch.jobs.store import ResultStore
+from tests._support.refusals import refused
 
 DIGESTS = {"request": "a", "photo": "b"}
 
@@ -17,7 +18,7 @@ def test_rows_are_read_again(tmp_path):
     store = ResultStore(tmp_path / "new")
     keys = ["a/1", "a-1", "../a", "é"]
     for i, key in enumerate(keys):
-        with pytest.raises(InvalidInputError, match=r"no result for .*; run again"):
+        with refused(r"no result for .*; run again"):
             store.read(key)
         store.append(row(key, i=i, value=float("nan"), values=[float("inf"), 1.5]))
     for again in (store, ResultStore(tmp_path / "new")):
@@ -74,7 +75,7 @@ def test_cut_line_is_removed(tmp_path, cut):
 )
 def test_other_files_are_refused(tmp_path, content):
     (tmp_path / "results.jsonl").write_text(content)
-    with pytest.raises(InvalidInputError, match=r"results\.jsonl: not results"):
+    with refused(r"results\.jsonl: not results"):
         ResultStore(tmp_path)
 
 

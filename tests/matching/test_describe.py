@@ -3,6 +3,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 import trimesh
+from torch.testing import assert_close
 
 from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewBank
@@ -31,9 +32,7 @@ def test_describer_renders_quarter_turns_once(truck, camera):
         ][0].norm()
         assert (together["points"][i] ^ alone["points"][0]).float().mean() < 0.01
         assert (together["silhouettes"][i] ^ alone["silhouettes"][0]).float().mean() < 0.001
-        torch.testing.assert_close(
-            together["boxes"][i], alone["boxes"][0], rtol=0, atol=1e-6 * describe.radius
-        )
+        assert_close(together["boxes"][i], alone["boxes"][0], rtol=0, atol=1e-6 * describe.radius)
 
 
 def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():
@@ -49,7 +48,7 @@ def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():
     )
     assert (expected["silhouettes"] ^ found["silhouettes"]).float().mean() < 1e-3
     assert torch.cosine_similarity(expected["descriptors"], found["descriptors"]).min() > 0.995
-    torch.testing.assert_close(found["boxes"], expected["boxes"])
+    assert_close(found["boxes"], expected["boxes"])
 
 
 def test_quarter_turns_groups_views_of_equal_direction_and_distance():
@@ -89,14 +88,12 @@ def test_shading_and_apparent_ridges_see_the_surface_of_perspective_views(truck,
     bank = ViewBank.build(
         truck, views, pipeline=Pipeline(bank=settings, terms=(Correlation(),)), progress=False
     )
-    torch.testing.assert_close(
-        bank.descriptors, describe.descriptor(describe.fields(*at)), rtol=0, atol=2e-3
-    )
-    torch.testing.assert_close(describe.descriptors(*at), describe.descriptor(describe.fields(*at)))
+    assert_close(bank.descriptors, describe.descriptor(describe.fields(*at)), rtol=0, atol=2e-3)
+    assert_close(describe.descriptors(*at), describe.descriptor(describe.fields(*at)))
     T, K, _ = describe.cameras(*at)
     field, pictures = describe.seen_by(T, K, shaded=True)
-    torch.testing.assert_close(field, describe.fields(*at))
-    torch.testing.assert_close(pictures, describe.shaded(*at))
+    assert_close(field, describe.fields(*at))
+    assert_close(pictures, describe.shaded(*at))
     assert describe.seen_by(T, K, shaded=False)[1] is None
 
 

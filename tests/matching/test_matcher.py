@@ -6,6 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
@@ -51,7 +52,7 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
         Repeatability().log_score(ranking.repeatability),
         box,
     )
-    torch.testing.assert_close(ranking.scores, sum(parts).exp())
+    assert_close(ranking.scores, sum(parts).exp())
     assert ranking.top(3).equal(ranking.order[:, :3])
     tied = matcher(torch.full((1, 1, 64, 64), 0.5), torch.tensor([[0.0, 0, 50, 50]]))
     assert tied.order[0].tolist() == list(range(len(bank)))
@@ -63,20 +64,16 @@ def test_matcher_is_batch_independent_and_takes_bytes_and_mixed_channels(matcher
     assert torch.equal(matcher(list(images), boxes).scores, together.scores)
     for i in range(3):
         alone = matcher(images[i : i + 1], boxes[i : i + 1])
-        torch.testing.assert_close(alone.scores[0], together.scores[i], rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(alone.hog[0], together.hog[i], rtol=1e-5, atol=1e-5)
+        assert_close(alone.scores[0], together.scores[i], rtol=1e-4, atol=1e-5)
+        assert_close(alone.hog[0], together.hog[i], rtol=1e-5, atol=1e-5)
     images, boxes = batch(0, 1)
     exact = (images * 255).round() / 255
     pixels = (images * 255).round().to(torch.uint8)
-    torch.testing.assert_close(matcher(pixels, boxes).scores, matcher(exact, boxes).scores)
+    assert_close(matcher(pixels, boxes).scores, matcher(exact, boxes).scores)
     grey = exact[1].mean(dim=0, keepdim=True)
     mixed = matcher([pixels[0], grey], boxes)
-    torch.testing.assert_close(
-        mixed.scores[0], matcher(exact[:1], boxes[:1]).scores[0], rtol=1e-4, atol=1e-5
-    )
-    torch.testing.assert_close(
-        mixed.scores[1], matcher([grey], boxes[1:]).scores[0], rtol=1e-4, atol=1e-5
-    )
+    assert_close(mixed.scores[0], matcher(exact[:1], boxes[:1]).scores[0], rtol=1e-4, atol=1e-5)
+    assert_close(mixed.scores[1], matcher([grey], boxes[1:]).scores[0], rtol=1e-4, atol=1e-5)
 
 
 def test_matcher_refuses_unusable_input(matcher):
@@ -109,12 +106,12 @@ def test_matcher_weights_terms(bank):
     images, boxes = batch(0, 1)
     without = bank.pipeline.with_term("repeatability", weight=0).with_term("box", weight=0)
     plain = ViewMatcher(bank, pipeline=without)(images, boxes)
-    torch.testing.assert_close(plain.scores, Correlation().log_score(plain.hog).exp())
+    assert_close(plain.scores, Correlation().log_score(plain.hog).exp())
     assert set(plain.terms) == {"hog"}, "a term without weight is not computed"
     squared = ViewMatcher(bank, pipeline=without.with_term("hog", weight=2))(images, boxes)
-    torch.testing.assert_close(squared.scores, plain.scores**2)
+    assert_close(squared.scores, plain.scores**2)
     wide = bank.pipeline.with_term("repeatability", sigma=1e6).with_term("box", sigma=1e6)
-    torch.testing.assert_close(
+    assert_close(
         ViewMatcher(bank, pipeline=wide)(images, boxes).scores, plain.scores, atol=1e-5, rtol=0
     )
     alone = ViewMatcher(bank, pipeline=replace(bank.pipeline, terms=(Correlation(),)))(

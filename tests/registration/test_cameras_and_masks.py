@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.testing import assert_close
 
 from curvireg_torch import Camera, camera_matrix, project_points, render_depth
 from curvireg_torch.errors import InvalidInputError
@@ -103,9 +104,7 @@ def test_mask_gives_the_box_and_the_outline():
     true_box = boxes_around(torch.stack([x, y], dim=1).float()) + torch.tensor(
         [-0.5, -0.5, 0.5, 0.5]
     )
-    torch.testing.assert_close(
-        as_photograph(photo, None, RADIAL, mask=mask).box, true_box, atol=1.0, rtol=0
-    )
+    assert_close(as_photograph(photo, None, RADIAL, mask=mask).box, true_box, atol=1.0, rtol=0)
     assert torch.equal(
         as_photograph(photo, box, RADIAL, mask=mask).box, undistorted(photo, RADIAL, box).box
     )
@@ -136,9 +135,7 @@ def test_a_given_mask_replaces_the_predicted_one_of_the_box():
         for mask in (None, torch.ones(SIZE, dtype=torch.bool))
     )
     predicted = register.object_mask(query, [none])
-    torch.testing.assert_close(
-        predicted, register.matcher.field.mask(query.crops), atol=1e-4, rtol=0
-    )
+    assert_close(predicted, register.matcher.field.mask(query.crops), atol=1e-4, rtol=0)
     assert register.object_mask(query, [given]).min() == 1.0
 
 
@@ -190,8 +187,8 @@ def test_camera_is_scaled_to_each_photograph():
     )
     point = torch.tensor([[0.4, 0.2, 1.0]]).double()
     large, small = (project_points(point, eye(4), items[i].K) for i in (0, 1))
-    torch.testing.assert_close((large + 0.5) / 2 - 0.5, small)
-    torch.testing.assert_close((items[0].box + 0.5) / 2 - 0.5, items[1].box, atol=0.02, rtol=0)
+    assert_close((large + 0.5) / 2 - 0.5, small)
+    assert_close((items[0].box + 0.5) / 2 - 0.5, items[1].box, atol=0.02, rtol=0)
     (error,) = as_photographs([photo[:, :90]], None, RADIAL)
     assert "calibrated for 240 x 180 px, but the photograph has 240 x 90 px" in str(error)
     with pytest.raises(InvalidInputError, match="expected 1, one for each image, got 2"):

@@ -118,12 +118,12 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
 def test_confidence_features():
     evidence = Evidence(
         rank=double([0.0, -1.0, -2.0]),
-        similarity=torch.tensor([0.7, 0.6, 0.5]).double(),
-        edge_support=torch.tensor([0.4, 0.5, 0.1]).double(),
-        appearance=torch.tensor([1.0, 0.4, 0.8]).double(),
+        similarity=double([0.7, 0.6, 0.5]),
+        edge_support=double([0.4, 0.5, 0.1]),
+        appearance=double([1.0, 0.4, 0.8]),
         keypoints=double([2.0, 0.0, 3.0]),
         details=double([0.5, 0.0, 0.0]),
-        contours=torch.tensor([0.9, 0.8, 1.0]).double(),
+        contours=double([0.9, 0.8, 1.0]),
     )
     scores = double([5.5, 2.0, 3.0])
     doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0, "focal": 0.3}
@@ -165,7 +165,7 @@ def test_undetermined_axes():
 
 
 def test_one_unknown_axis_counts_once_in_any_direction():
-    axis = torch.nn.functional.normalize(torch.tensor([1.0, 1.0, 0.8]).double(), dim=0)
+    axis = torch.nn.functional.normalize(double([1.0, 1.0, 0.8]), dim=0)
     covariance = torch.zeros(6, 6, dtype=torch.float64)
     covariance[:3, :3] = math.pi**2 * torch.outer(axis, axis)
     assert confidence.undetermined_axes(covariance) == pytest.approx(1.0)

@@ -16,7 +16,7 @@ from tests._support.numbers import double, eye, seeded
 from tests._support.results import registration
 from tests._support.scenes import CAMERA
 
-COVARIANCE = torch.diag(torch.tensor([0.02, 0.05, 0.03, 1.0, 2.0, 8.0]).double().square())
+COVARIANCE = torch.diag(double([0.02, 0.05, 0.03, 1.0, 2.0, 8.0]).square())
 CENTRE = double([20.0, -30.0, 10.0])
 
 
@@ -64,7 +64,7 @@ def test_a_principal_point_that_is_not_known_leaves_the_allocentric_rotation_exa
 
 def test_a_turn_that_nothing_determines_is_left_out():
     R, t, allocentric, distance = pose()
-    known = torch.diag(torch.tensor([1e-4, 1e-4, 9.0, 1.0, 1.0, 1.0]).double())
+    known = torch.diag(double([1e-4, 1e-4, 9.0, 1.0, 1.0, 1.0]))
     assert exactness_of(known, R, t, allocentric, distance).rotation_deg < 2.0
     nothing = torch.diag(double([9.0, 9.0, 9.0, 1.0, 1.0, 1.0]))
     unknown = exactness_of(nothing, R, t, allocentric, distance)
@@ -78,7 +78,7 @@ def test_words_have_one_digit():
 
 
 def test_results_say_how_exact_they_are_and_what_the_distance_holds_for():
-    covariance = torch.diag(torch.tensor([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3]).double())
+    covariance = torch.diag(double([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3]))
     result = registration(covariance, confidence=0.95)
     document = result.to_dict()
     assert document["exactness"]["words"] == result.exactness.words

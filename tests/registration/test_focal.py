@@ -105,7 +105,7 @@ def test_zoomed_poses_keep_their_images():
 def test_priors_by_source():
     image, box, _ = near_scene()
     item = as_photograph(image, box, NEAR)
-    cameras = focal_length.scaled_cameras(NEAR[None], torch.tensor([0.1]).double())
+    cameras = focal_length.scaled_cameras(NEAR[None], double([0.1]))
     exif = camera_module.focal_prior(item.by(NEAR, focal_deviation=0.05, source="exif"), cameras)
     assert float(exif.log_zoom) == pytest.approx(-0.1)
     assert (float(exif.low), float(exif.high)) == (pytest.approx(-0.3), pytest.approx(0.1))

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar
-from curvireg_torch.errors import InvalidInputError, LostObjectError
+from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import pose_around
 from curvireg_torch.registration import FailedRegistration, Follower, refine, tracking
@@ -18,6 +18,7 @@ from curvireg_torch.registration.tracking import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 from tests._support.numbers import double, seeded
 from tests._support.quick import slow_after
+from tests._support.refusals import refused
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, sequence, truck_registrar
 
 LOST = Mock(side_effect=LostObjectError("lost"))
@@ -265,9 +266,9 @@ def test_follower_loses_an_absent_object_and_finds_it_again():
 @pytest.mark.parametrize("confidence", [math.nan, 1.5, -0.1, "sure"])
 def test_a_start_needs_a_probability(confidence):
     image, _, T = sequence(1)[0]
-    with pytest.raises(InvalidInputError, match="confidence"):
+    with refused("confidence"):
         Follower(truck_registrar(), CAMERA).start(image, T, confidence=confidence)
-    with pytest.raises(InvalidInputError, match="start_confidences"):
+    with refused("start_confidences"):
         refine(truck_registrar(), [image], CAMERA, [T], start_confidences=[confidence])
 
 

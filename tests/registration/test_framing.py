@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from torch.testing import assert_close
 
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.geometry.framing import (
@@ -68,14 +69,8 @@ def test_warnings_begin_at_a_tenth():
 )
 def test_boxes_are_clipped_to_the_photograph(box, part, sides):
     item = as_photograph(torch.rand(3, 80, 100), torch.tensor(box, dtype=torch.float32))
-    assert (
-        item.box.tolist() == list(part) == clipped(torch.tensor(box).double(), (80, 100)).tolist()
-    )
-    assert (
-        border_sides(item.box, (80, 100))
-        == border_sides(torch.tensor(box).double(), (80, 100))
-        == sides
-    )
+    assert item.box.tolist() == list(part) == clipped(double(box), (80, 100)).tolist()
+    assert border_sides(item.box, (80, 100)) == border_sides(double(box), (80, 100)) == sides
 
 
 def test_a_cut_object_has_a_warning_and_is_not_reliable():
@@ -100,7 +95,7 @@ def test_whole_boxes_go_on_beyond_the_border_alone():
     corner = torch.tensor([150.0, 60.0, 199.5, 99.5])
     near, far = whole_boxes(corner, size)
     expected = torch.tensor([150.0, 60.0, 199.5 + 0.4 * 49.5, 99.5 + 0.4 * 39.5])
-    torch.testing.assert_close(near, expected)
+    assert_close(near, expected)
     assert (far - corner).tolist() == pytest.approx([0.0, 0.0, 1.2 * 49.5, 1.2 * 39.5], abs=1e-4)
     across = torch.tensor([-0.5, 20.0, 199.5, 50.0])
     wide = whole_boxes(across, size)[0]
@@ -113,7 +108,7 @@ def test_frame_knows_what_of_a_crop_lies_in_the_photograph():
     frame = CropFrame.of(box, photograph_box((100, 200)), side=16, margin=0.0)
     corners = double([[-20.5, 49.5, 1.0], [59.5, 129.5, 1.0]])
     expected = double([[-0.5, -0.5, 1.0], [15.5, 15.5, 1.0]])
-    torch.testing.assert_close(corners @ frame.transform.T, expected)
+    assert_close(corners @ frame.transform.T, expected)
     columns = torch.arange(16) >= 4
     rows = torch.arange(16) < 10
     assert frame.inside.equal((rows[:, None] & columns)[None])

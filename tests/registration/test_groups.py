@@ -41,7 +41,7 @@ def turned(*viewpoints):
 
 
 def rivals_of(*viewpoints, scores):
-    values = torch.tensor(scores).double()
+    values = double(scores)
     views = turned((0.0, 20.0), (90.0, 20.0), (180.0, 20.0), (0.0, -70.0)).float()
     ranked = torch.tensor([1.0, 0.9, 0.95, 0.8])
     return Rivals(turned(*viewpoints), values, values - 0.5, FEATURES, views, ranked)
@@ -100,7 +100,7 @@ def test_axes_agree_by_their_direction_whatever_the_turn():
     assert directions_agree(both, either, AXIS_TOLERANCE).tolist() == [True, True]
 
 
-WEIGHTS = torch.tensor([1.0, 0.9, 0.95, 0.8]).double() ** 4  # of the ranked views
+WEIGHTS = double([1.0, 0.9, 0.95, 0.8]) ** 4  # of the ranked views
 
 
 def expected_of(rivals, views, **features):

@@ -5,6 +5,7 @@ from dataclasses import fields
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.matching import Ranking
@@ -47,14 +48,12 @@ def test_poses_fill_their_box():
     describer, (_, box, T) = truck_registrar().describer, scene(0)
     none = torch.zeros(1, dtype=torch.long)
     exact = Hypotheses.at(T[None], CAMERA[None], describer.centre, none, none)
-    torch.testing.assert_close(
-        exact.distance, (T[:3, :3] @ describer.centre + T[:3, 3]).norm()[None]
-    )
+    assert_close(exact.distance, (T[:3, :3] @ describer.centre + T[:3, 3]).norm()[None])
     again = Hypotheses.in_boxes(
         describer, box[None], CAMERA[None], exact.rotation, exact.distance, none, none
     )
     assert rotation_error(again.T[0, :3, :3], T[:3, :3]) < 2.0
     assert ((again.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.03
-    torch.testing.assert_close(
+    assert_close(
         again.distance, (again.T[0, :3, :3] @ describer.centre + again.T[0, :3, 3]).norm()[None]
     )

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch import camera_matrix
 from curvireg_torch.errors import InvalidInputError
@@ -116,7 +117,7 @@ def test_poses_are_turned_into_all_limits_about_their_centre():
     assert COMBINED.excess(moved.T[:, :3, :3]).max() < 0.01
     assert limits.moved_inside(moved).T.equal(moved.T)
     before, after = (P[:, :3, :3] @ describer.centre + P[:, :3, 3] for P in (poses.T, moved.T))
-    torch.testing.assert_close(before, after)
+    assert_close(before, after)
 
 
 @pytest.mark.parametrize("seed", slow_after(1, range(4)))
@@ -174,4 +175,4 @@ def test_limits_on_the_distance_keep_contradict_and_move_poses():
     words = [limits.contradiction(pose_at(1.5), pose, better_outside=False) for pose in asked]
     assert words == ["better outside", None, None, "better outside"]
     for away, expected in ((0.5, 1.0), (1.5, 1.5), (9.0, 2.0)):
-        torch.testing.assert_close(limits.moved_inside(pose_at(away)).T, pose_at(expected).T)
+        assert_close(limits.moved_inside(pose_at(away)).T, pose_at(expected).T)

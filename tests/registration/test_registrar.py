@@ -235,7 +235,7 @@ def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
 def test_origin_of_the_mesh_may_be_far_away():
     """A million radii, as in geographic coordinates."""
     mesh = example_mesh()
-    away = torch.tensor([1e6 * float(mesh_radius(example_mesh())), 0.0, 0.0]).double()
+    away = double([1e6 * float(mesh_radius(example_mesh())), 0.0, 0.0])
     mesh.apply_translation(away.numpy())
     views = sample_views(azimuth_step=15, elevations=[0, 20, 40])
     result = Registrar(ViewBank.build(mesh, views, image_size=96, progress=False))(

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.fitting.contour_problem import ContourProblem
@@ -26,7 +27,7 @@ def turned(*degrees, shift=0.0):
     """(N, 4, 4) world poses about the z axis through the object's centre."""
     angles = torch.deg2rad(double(degrees))
     R = rotation_from_axis_angle(angles[:, None] * double([0.0, 0.0, 1.0]))
-    moved = torch.tensor([shift, 0.0, 0.0]).double() + CENTRE
+    moved = double([shift, 0.0, 0.0]) + CENTRE
     return transform(R, moved - (R @ CENTRE))
 
 
@@ -68,7 +69,7 @@ def test_a_photograph_knows_the_place_across_its_ray_better_than_along_it():
     along = rig_module.DEPTH_ERROR * 10.0
     across = math.hypot(rig_module.CENTRE_ERROR * RADIUS, rig_module.RIG_ERROR * 10.0)
     expected = torch.diag(double([along, across, across]) ** -2.0)
-    torch.testing.assert_close(precision, expected)
+    assert_close(precision, expected)
     assert along > across
 
 
@@ -147,7 +148,7 @@ def test_rays_that_are_nearly_parallel_tell_no_unit():
 
 def test_a_photograph_lowers_a_pose_by_five_points_at_most():
     low = -torch.inf
-    scores = torch.tensor([[3.0, 1.0, -9.0, low], [low, low, low, low]]).double()
+    scores = double([[3.0, 1.0, -9.0, low], [low, low, low, low]])
     assert rig_module._bounded(scores).tolist() == [[3.0, 1.0, -2.0, -2.0], [0.0] * 4]
 
 
@@ -155,7 +156,7 @@ def test_unknown_covariances_have_nearly_no_precision():
     known = torch.diag(torch.arange(1.0, 7.0).double())
     both = torch.stack([known, torch.full((6, 6), torch.nan).double()])
     precision = rig_module._inverse(both)
-    torch.testing.assert_close(precision[0], torch.linalg.inv(known))
+    assert_close(precision[0], torch.linalg.inv(known))
     assert 0.0 < precision[1].diagonal().max() < 1e-9
 
 
@@ -194,7 +195,7 @@ def problem(**changes):
 
 
 def test_photographs_of_a_pose_take_the_shortest_step_of_all(monkeypatch):
-    fractions = torch.tensor([0.9, 0.4, 0.7, 1.0]).double()
+    fractions = double([0.9, 0.4, 0.7, 1.0])
     monkeypatch.setattr(ContourProblem, "step_fraction", lambda *_: fractions)
     found = problem().step_fraction(torch.zeros(4, 6), ORIGIN.repeat(4, 1, 1))
     assert found.tolist() == pytest.approx([0.4, 0.4, 0.7, 0.7])
@@ -213,16 +214,16 @@ def test_gaps_are_towards_the_poses_that_photographs_alone_found():
     expected = torch.zeros(4, 6, dtype=torch.float64)
     expected[0, 2] = 2.0 * math.radians(10.0)
     expected[1, 3] = 1.0
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
 
 
 def test_a_solution_is_common_to_the_photographs_along_their_own_axes():
     """Each photograph knows one direction of the world well: together they know both."""
-    quarter = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2]).double())
+    quarter = rotation_from_axis_angle(double([0.0, 0.0, math.pi / 2]))
     axes = torch.stack([torch.eye(3).double(), quarter] * 2)
-    wanted = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]).double()
+    wanted = double([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     P = rig_module.in_frames(axes)
     A = torch.stack([torch.diag(torch.tensor([5.0, 1.0, 1.0, 5.0, 1.0, 1.0]))] * 4).double()
     own = (P @ wanted[:, None])[..., 0]
     steps = problem(axes=axes).solution(A, (A @ own[..., None]))
-    torch.testing.assert_close(steps, own, rtol=0.05, atol=0.02)
+    assert_close(steps, own, rtol=0.05, atol=0.02)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 import trimesh
+from torch.testing import assert_close
 
 from curvireg_torch import Registrar, ViewBank
 from curvireg_torch.errors import InvalidInputError
@@ -44,7 +45,7 @@ def test_angles_near_run_on_past_the_pole():
     angles = torch.stack([one.azimuth, one.elevation, one.theta], dim=1).double()
     same = search.angles_near(angles, angles[20])
     before, after = (rotation_from_viewpoint(*x.unbind(1)) for x in (angles, same))
-    torch.testing.assert_close(before, after, rtol=0, atol=1e-6)
+    assert_close(before, after, rtol=0, atol=1e-6)
     assert same[20].tolist() == angles[20].tolist()
     past = 2 * 18 + 2  # elevation 100 degrees, above elevation 50 with the same azimuth
     assert torch.allclose(same[past] - same[20], double([0.0, 50.0, 0.0]), atol=1e-4)
@@ -273,11 +274,9 @@ def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh
     one, other = (
         ViewBank.build(m, pipeline=PRESETS["paper"], progress=False) for m in (mesh, copy)
     )
-    torch.testing.assert_close(
-        other.rotations.double() @ turn, one.rotations.double(), rtol=0, atol=1e-5
-    )
+    assert_close(other.rotations.double() @ turn, one.rotations.double(), rtol=0, atol=1e-5)
     in_frame = one.rotations.double() @ principal_rotation(one.mesh).T
-    torch.testing.assert_close(in_frame, paper_views().rotations.double(), rtol=0, atol=1e-5)
+    assert_close(in_frame, paper_views().rotations.double(), rtol=0, atol=1e-5)
     image, box, _ = scene(0)
     first, second = (Registrar(bank)([image], box[None])[0] for bank in (one, other))
     # the allocentric one is what is searched for: the other follows from the centre of a box, which

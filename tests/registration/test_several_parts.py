@@ -68,7 +68,7 @@ class FakeRig:
         return FakeRig(None, usable)
 
     def answer(self):
-        rows = torch.tensor([self.scores[p.index] for p in self.photographs]).double()
+        rows = double([self.scores[p.index] for p in self.photographs])
         nothing = torch.zeros_like(rows)
         values = Evidence(*[nothing] * len(fields(Evidence)))
         M = rows.shape[1]
@@ -80,7 +80,7 @@ class FakeRig:
         return {index: why for index, why in self.missing.items() if index in there}
 
     def weights(self, _):
-        return torch.tensor([self.vote.get(p.index, 1.0) for p in self.photographs]).double()
+        return double([self.vote.get(p.index, 1.0) for p in self.photographs])
 
     def angles(self, poses, _):
         return poses[:, 0, 0]

@@ -7,6 +7,7 @@ from unittest.mock import MagicMock
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.geometry import (
@@ -139,7 +140,7 @@ def test_the_best_pose_stays_and_its_sibling_is_its_rival(monkeypatch):
     assert torch.equal(poses.T, case.poses.T)
     assert changed.similarity.tolist() == pytest.approx([0.99, 0.9, 0.5])
     # a symmetry turns the model, before it is posed
-    torch.testing.assert_close(rival.T[0], case.poses.T[1] @ case.symmetries[1])
+    assert_close(rival.T[0], case.poses.T[1] @ case.symmetries[1])
     assert float(rival.evidence.similarity) == pytest.approx(0.9 + 0.75 - 0.80)
     assert not case.fitted
 
@@ -148,11 +149,11 @@ def test_a_better_sibling_is_fitted_and_the_pose_before_is_its_rival(monkeypatch
     case = Case(monkeypatch, [0.80, 0.70, 0.90])
     poses, changed, rival = case.run()
     (start,) = case.fitted
-    torch.testing.assert_close(start.T[0], case.poses.T[1] @ case.symmetries[2])
+    assert_close(start.T[0], case.poses.T[1] @ case.symmetries[2])
     assert float(poses.T[1, 0, 3] - start.T[0, 0, 3]) == pytest.approx(1e-3)
     assert torch.equal(poses.T[[0, 2]], case.poses.T[[0, 2]])
     assert changed.similarity.tolist() == pytest.approx([0.99, 0.95, 0.5])
-    torch.testing.assert_close(rival.T[0], case.poses.T[1])
+    assert_close(rival.T[0], case.poses.T[1])
     assert float(rival.evidence.similarity) == pytest.approx(0.95 + 0.80 - 0.90)
 
 

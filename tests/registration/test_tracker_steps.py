@@ -97,7 +97,7 @@ def fitted(
     """The weighted flows that a fit uses, of the keyframe that is nearest: the second. In the first
     crop, with a focal length of 1 px, the flow moves the object by a ``shift`` in px. Steps leave a
     pose that is not quite rigid; their radii in px are ``searched``."""
-    cameras = [torch.tensor([zoom, zoom, 1.0]).double().diag()[None] for zoom in (1.0, 2.0)]
+    cameras = [double([zoom, zoom, 1.0]).diag()[None] for zoom in (1.0, 2.0)]
     frames = [SimpleNamespace(K=camera, problem=Problem(stale)) for camera in cameras]
     used = []
 
@@ -168,7 +168,7 @@ def test_a_round_is_left_out_after_one_that_hardly_moved_the_contours(monkeypatc
 
 
 def features(mean, variance, flows):
-    ends = torch.tensor(mean).double(), torch.tensor(variance).double()
+    ends = double(mean), double(variance)
     follow = SimpleNamespace(
         _regions=SimpleNamespace(ends=lambda *_: ends),
         _silhouette=lambda *_: None,
@@ -306,7 +306,7 @@ def test_lines_along_which_colours_say_nothing_do_not_count():
     radius = 4
     flat = radius**2 / 3.0 - tracking.REGION_VARIANCE
     mean = double([1.0, 2.0, -1.0])
-    variance = torch.tensor([0.0, flat, 2.0 * flat]).double()
+    variance = double([0.0, flat, 2.0 * flat])
     J = torch.ones(1, 3, 6).double()
     follow = SimpleNamespace(
         _regions=SimpleNamespace(ends=lambda *_: (mean, variance)), _silhouette=lambda *_: None

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evidence import EvidenceWeights
@@ -34,7 +35,7 @@ BOX = torch.tensor([60.0, 40.0, 180.0, 140.0])
 def poses_at(count, *, K=CAMERA, rank=None):
     """Of the views 0, 1, ..., turned about the vertical axis."""
     R = torch.stack([rotation_from_viewpoint(70.0 * k, 30.0, 0.0).double() for k in range(count)])
-    T = transform(R, torch.tensor([0.1, 0.0, 5.0]).double().expand(count, 3))
+    T = transform(R, double([0.1, 0.0, 5.0]).expand(count, 3))
     ranks = double(rank or [0.0] * count)
     return Hypotheses.at(T, K.expand(count, 3, 3), CENTRE, torch.arange(count), ranks)
 
@@ -63,9 +64,7 @@ def test_the_angle_to_the_centre_of_the_box():
 
 def test_starts_are_the_best_view_of_each_camera_and_the_best_views():
     """Of three cameras and four views; the short fits of the second camera reach most."""
-    support = torch.tensor(
-        [[0.20, 0.30, 0.10, 0.10], [0.50, 0.10, 0.45, 0.10], [0.10, 0.15, 0.10, 0.40]]
-    ).double()
+    support = double([[0.20, 0.30, 0.10, 0.10], [0.50, 0.10, 0.45, 0.10], [0.10, 0.15, 0.10, 0.40]])
     ranked = support * 20.0 - torch.arange(4)
     found = [divmod(place, 4) for place in camera_module.best_of_fields(ranked, 2).tolist()]
     # the best view of each camera, and the third view with its best camera, the second best of all
@@ -123,12 +122,10 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
     # a twist turns about the centre, and moves it
     moved = apply_twist(pose.T, step * motion, CENTRE)
     shift = point_in_cameras(moved, CENTRE) - point_in_cameras(pose.T, CENTRE)
-    torch.testing.assert_close(shift / step, motion[:, 3:], atol=1e-6, rtol=1e-6)
+    assert_close(shift / step, motion[:, 3:], atol=1e-6, rtol=1e-6)
     origin = (moved - pose.T)[:, :3, 3] / step
     expected = torch.cat([motion[:, :3], origin], dim=1)[0]
-    torch.testing.assert_close(
-        covariance[0], variance * expected[:, None] * expected, atol=1e-6, rtol=1e-4
-    )
+    assert_close(covariance[0], variance * expected[:, None] * expected, atol=1e-6, rtol=1e-4)
 
 
 def refitted(
@@ -202,7 +199,7 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
     poses = poses_at(3)
     poses = replace(
         poses,
-        cameras=scaled_cameras(poses.cameras, torch.tensor([0.0, 0.1, 0.2]).double()),
+        cameras=scaled_cameras(poses.cameras, double([0.0, 0.1, 0.2])),
         covariance=torch.ones(3, 6, 6, dtype=torch.float64),
     )
     best = torch.full((1, 6, 6), 2.0, dtype=torch.float64)

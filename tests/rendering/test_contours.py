@@ -36,7 +36,7 @@ def poses():
     T = []
     for azimuth, elevation, distance in ((20, 25, 5), (110, 40, 6), (200, 10, 7), (290, 60, 8)):
         R = rotation_from_viewpoint(float(azimuth), float(elevation), 10.0).double()
-        T.append(transform(R, torch.tensor([0.0, 0.0, float(distance)]).double()))
+        T.append(transform(R, double([0.0, 0.0, float(distance)])))
     return torch.stack(T)
 
 

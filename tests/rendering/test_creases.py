@@ -15,13 +15,14 @@ from curvireg_torch.rendering.contours import (
     _Places,
     _Views,
 )
+from tests._support.numbers import double
 
 SIZE = 128
 DISTANCE = 10.0
 PIXEL = 0.01
 """Length of a pixel at the plate's distance."""
-K = torch.tensor([[DISTANCE / PIXEL, 0, 63.5], [0, DISTANCE / PIXEL, 63.5], [0, 0, 1]]).double()
-IN_FRONT = transform(torch.eye(3).double(), torch.tensor([0.0, 0.0, DISTANCE]).double())[None]
+K = double([[DISTANCE / PIXEL, 0, 63.5], [0, DISTANCE / PIXEL, 63.5], [0, 0, 1]])
+IN_FRONT = transform(torch.eye(3).double(), double([0.0, 0.0, DISTANCE]))[None]
 
 
 def strip(x, z, y=0.5):

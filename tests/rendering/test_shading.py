@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch.rendering.shading import AMBIENT, LIT, shade
 from tests._support.numbers import double
@@ -18,10 +19,10 @@ def test_shade_is_exact_for_planes(normal):
     along = torch.einsum("i,ihw->hw", n, RAYS)
     cosine = along / n.norm() / RAYS.norm(dim=0)
     grey = shade((5.0 / along)[None, None], K)[0, 0]
-    torch.testing.assert_close(grey, AMBIENT + (LIT - AMBIENT) * cosine, atol=2e-4, rtol=0)
+    assert_close(grey, AMBIENT + (LIT - AMBIENT) * cosine, atol=2e-4, rtol=0)
     depth = (7.0 + 0.3 * RAYS[0] - 0.6 * RAYS[1])[None, None]
     expected = AMBIENT + (LIT - AMBIENT) / math.sqrt(1 + 0.3**2 + 0.6**2)
-    torch.testing.assert_close(
+    assert_close(
         shade(depth, K, orthographic=True), torch.full_like(depth, expected), atol=2e-4, rtol=0
     )
 

@@ -22,9 +22,10 @@ from scripts.calibration.misleading import (
     cases_of,
     table_of,
 )
+from tests._support.numbers import double
 
 H, W = 240, 320
-K = torch.tensor([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]]).double()
+K = double([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])
 SPOT = (250, 60)  # x, y of the brightest pixel, in the box
 BOX = torch.tensor([220.0, 40.0, 280.0, 90.0])
 
@@ -157,18 +158,18 @@ def test_an_answer_is_wrong_by_its_angle_its_distance_or_its_mesh(small_bank):
     farther = row | {"translation": LARGER * row["translation"]}
     assert answer_of(result, registrar, farther, scene.camera_matrix, 0)["wrong"]
     assert not answer_of(result, registrar, farther, None, 0)["wrong"]
-    turned = cr.geometry.rotation_from_axis_angle(torch.tensor([0.0, 0.7, 0.0]).double())
+    turned = cr.geometry.rotation_from_axis_angle(double([0.0, 0.7, 0.0]))
     other = row | {"rotation": turned @ row["rotation"]}
     assert answer_of(result, registrar, other, None, 0)["wrong"]
 
 
 def test_pairs_and_axes_are_right_within_their_bounds():
-    axis = Axis(torch.tensor([0.0, 0.0, 1.0]).double(), 0.9)
+    axis = Axis(double([0.0, 0.0, 1.0]), 0.9)
     result = SimpleNamespace(pair_probability=0.8, probabilities=(0.5, 0.0, 0.3, 0.1), axis=axis)
     errors = torch.tensor([150.0, 5.0, 29.0, 3.0])
 
     def judged(degrees, *, ends_are_alike=False):
-        turn = rotation_from_axis_angle(torch.tensor([radians(degrees), 0.0, 0.0]).double())
+        turn = rotation_from_axis_angle(double([radians(degrees), 0.0, 0.0]))
         registrar = SimpleNamespace(round_axis=SimpleNamespace(ends_are_alike=ends_are_alike))
         return groups_of(result, registrar, turn, errors)
 

@@ -27,6 +27,7 @@ from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
 from scripts.paper.measures import Estimate, bootstrap, points_within
+from tests._support.numbers import double
 from tests._support.scenes import write_photo
 
 SETTINGS = BankSettings(image_size=64)
@@ -181,8 +182,8 @@ def test_a_mesh_is_rendered_once():
     renderer = measure.Remembered(example_mesh())
     renderer._inner = Mock(wraps=renderer._inner)
     T = torch.eye(4)[None].repeat(2, 1, 1).double()
-    T[:, 2, 3] = torch.tensor([1.0, 2.0]).double()
-    K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]]).double().expand(2, 3, 3)
+    T[:, 2, 3] = double([1.0, 2.0])
+    K = double([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]]).expand(2, 3, 3)
     first = renderer.render(T, K, (64, 64))
     second = renderer.render(T, K, (64, 64))
     assert torch.equal(first, second)

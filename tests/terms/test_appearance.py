@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from torch.testing import assert_close
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
 from curvireg_torch.features.backbone import Backbone, describe, similarity
@@ -37,16 +38,16 @@ def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
     pictures = matcher.describer.shaded(small_bank.rotations, small_bank.distances)
     assert pictures.shape == (len(small_bank), 1, 64, 64)
     expected = describe(pictures, Backbone())
-    torch.testing.assert_close(small_bank.appearance, expected, atol=2e-3, rtol=0)
+    assert_close(small_bank.appearance, expected, atol=2e-3, rtol=0)
     query = matcher.query(*photograph(0))
     ranking = matcher.rank(query)
     raw = similarity(describe(query.crops, Backbone()), expected)
-    torch.testing.assert_close(ranking.terms["appearance"], raw, atol=2e-3, rtol=0)
+    assert_close(ranking.terms["appearance"], raw, atol=2e-3, rtol=0)
     small_bank.save(tmp_path / "bank.safetensors")
     loaded = ViewMatcher(ViewBank.load(tmp_path / "bank.safetensors"), pipeline=PIPELINE)(
         *photograph(0)
     )
-    torch.testing.assert_close(loaded.scores, ranking.scores, atol=1e-3, rtol=1e-2)
+    assert_close(loaded.scores, ranking.scores, atol=1e-3, rtol=1e-2)
 
 
 def test_large_bank_compares_the_cells_of_the_best_views(small_bank, truck, matcher):
@@ -65,7 +66,7 @@ def test_large_bank_compares_the_cells_of_the_best_views(small_bank, truck, matc
     raw = ranking.terms["appearance"][0]
     assert sorted(raw.isfinite().nonzero()[:, 0].tolist()) == sorted(compared.tolist())
     exhaustive = matcher(*photograph(2)).terms["appearance"][0]
-    torch.testing.assert_close(raw[compared], exhaustive[compared], atol=3e-3, rtol=0)
+    assert_close(raw[compared], exhaustive[compared], atol=3e-3, rtol=0)
     # Every other view has the score of the nearest compared view.
     score = Appearance().log_score(raw[compared][None])[0]
     angles = rotation_error(large_bank.rotations[:, None], large_bank.rotations[compared][None])
@@ -73,7 +74,7 @@ def test_large_bank_compares_the_cells_of_the_best_views(small_bank, truck, matc
     unique = second - first > 1.0
     assert unique.sum() > 10
     expected = before.scores[0] * torch.exp(2.0 * score[angles.argmin(dim=1)])
-    torch.testing.assert_close(ranking.scores[0, unique], expected[unique], rtol=1e-4, atol=1e-7)
+    assert_close(ranking.scores[0, unique], expected[unique], rtol=1e-4, atol=1e-7)
     assert torch.equal(reranking(*photograph(2)).scores, ranking.scores), "cached features"
 
 

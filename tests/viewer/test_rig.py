@@ -9,6 +9,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import InvalidInputError
@@ -21,6 +22,7 @@ from curvireg_torch.viewer import session as session_module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.workspace import Workspace
 from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos, written
+from tests._support.numbers import double
 from tests._support.scenes import learned_registrar
 from tests.registration.test_several import WORLD
 from tests.viewer.test_workspace import upload
@@ -86,7 +88,7 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
     assert main(["register", *files, "--quiet", "--out", str(tmp_path / "result")]) == 0
     written = json.loads((tmp_path / "result" / "result.json").read_text())
     document = json.loads(to_json(session.document()))
-    assert rotation_error(torch.tensor(document["rotation"]).double(), WORLD[:3, :3]) < 1.5
+    assert rotation_error(double(document["rotation"]), WORLD[:3, :3]) < 1.5
     assert [*document] == [*written, "viewer"]
     for row in written["photographs"]:
         row["photo"] = Path(row["photo"]).name
@@ -136,15 +138,11 @@ def test_another_answer_and_a_pose_by_hand_are_those_of_all_photographs(found):
 
     def check():
         document = json.loads(to_json(session.document()))
-        world = torch.tensor(document["rotation"]).double()
+        world = double(document["rotation"])
         assert document["rotation"] == first.answer.pose.rotation.tolist()
         for shot, row in zip((first, last), document["photographs"], strict=True):
-            torch.testing.assert_close(
-                shot.projection[0][:3, :3], shot.view.T_cam_from_world[:3, :3] @ world
-            )
-            torch.testing.assert_close(
-                shot.projection[0][:3, :3], torch.tensor(row["rotation"]).double()
-            )
+            assert_close(shot.projection[0][:3, :3], shot.view.T_cam_from_world[:3, :3] @ world)
+            assert_close(shot.projection[0][:3, :3], double(row["rotation"]))
             assert (row["edge_support"], row["name"], row["failure"]) == (None, row["name"], None)
         assert document["T_cam_from_model"] is None
         return document
@@ -154,11 +152,11 @@ def test_another_answer_and_a_pose_by_hand_are_those_of_all_photographs(found):
     before = first.projection[0]
     moved = first.result.moved(before, translation=(0.2, 0, 0))
     first.place(moved)
-    torch.testing.assert_close(first.projection[0], moved)
+    assert_close(first.projection[0], moved)
     assert check()["viewer"]["by_hand"] == ["moved: rotated 0.0 degrees, shifted 0.20 radii"]
     assert first.glb()[:4] == b"glTF"
     last.undo()
-    torch.testing.assert_close(first.projection[0], before)
+    assert_close(first.projection[0], before)
     first.choose(0)
 
 

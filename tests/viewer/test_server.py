@@ -8,9 +8,10 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from tests._support.refusals import refused
+
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
-from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.viewer.server import (
     SECURITY_HEADERS,
     guarded,
@@ -168,10 +169,10 @@ def test_every_answer_has_the_security_headers():
 def test_listen_names_a_used_port_and_a_host_that_is_not_ours():
     with listen("127.0.0.1", 0) as listener:
         port = listener.getsockname()[1]
-        with pytest.raises(InvalidInputError, match=rf"^--port {port}: in use by another program"):
+        with refused(rf"^--port {port}: in use by another program"):
             listen("127.0.0.1", port)
     for host in ("192.0.2.1", "no.such.host.invalid"):
-        with pytest.raises(InvalidInputError, match=re.escape(f"--host {host}")):
+        with refused(re.escape(f"--host {host}")):
             listen(host, 0)
 
 
