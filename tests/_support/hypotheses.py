@@ -16,14 +16,14 @@ def turned(*degrees):
     return torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in degrees])
 
 
-def poses_at(*degrees, x=0.0):
+def poses_at(*degrees, x=0.0, centre=(0.0, 0.0, 0.0)):
     """Of the views 0, 1, ..., five units away and ``x`` to the right."""
     R = turned(*degrees)
     count = len(R)
     T = transform(R, double([x, 0.0, 5.0]).expand(count, 3))
-    centre = double([0.0, 0.0, 0.0])
     rank = torch.zeros(count, dtype=torch.float64)
-    return Hypotheses.at(T, CAMERA.expand(count, 3, 3), centre, torch.arange(count), rank)
+    cameras = CAMERA.expand(count, 3, 3)
+    return Hypotheses.at(T, cameras, torch.as_tensor(centre).double(), torch.arange(count), rank)
 
 
 def evidence_of(*similarity, **columns):

@@ -157,14 +157,25 @@ def test_damaged_models_info_is_refused_when_the_dataset_is_opened(tree, change,
 MIRRORED = [-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]
 
 
-INVALID = [None, "x", {"a": 1}, [1, 2], ["1"] * 9, [True] * 9, [1e400] * 9, [10**400] * 9, MIRRORED]
+ROTATIONS = [
+    *(None, "x", {"a": 1}, [1, 2], ["1"] * 9, [True] * 9, [1e400] * 9, [10**400] * 9),
+    MIRRORED,
+]
+BOXES = [[4, 4, 0, 20], [4, 4, 30, 0], [-1, -1, -1, -1]]
 
 
-@pytest.mark.parametrize("value", INVALID)
-def test_bop_dataset_counts_invalid_rotations(tree, value):
-    edit(tree, "scene_gt.json", lambda content: content["0"][0].update(cam_R_m2c=value))
+@pytest.mark.parametrize(
+    ("name", "key", "value", "reason"),
+    [
+        *(("scene_gt.json", "cam_R_m2c", R, "corrupt_annotation") for R in ROTATIONS),
+        *(("scene_gt_info.json", "bbox_obj", box, "bad_box") for box in BOXES),
+    ],
+)
+def test_bop_dataset_counts_invalid_rotations_and_boxes(tree, name, key, value, reason):
+    edit(tree, name, lambda content: content["0"][0].update({key: value}))
     dataset = BOPDataset(tree[0], targets=False)
-    assert dataset.skipped["corrupt_annotation"] == tree[1]["corrupt_annotation"] + 1
+    assert dataset.skipped[reason] == tree[1][reason] + 1
+    assert len(dataset) == 3
 
 
 @pytest.mark.parametrize(("place", "value"), [(0, 0.0), (4, -500.0), (1, 2.0), (8, 2.0)])
@@ -293,14 +304,3 @@ def test_bop_pictures_are_found_however_their_suffix_is_spelled(tree):
     for path in (tree[0] / "test").glob("*/rgb/*"):
         path.rename(path.with_suffix(path.suffix.capitalize()))
     assert len(BOPDataset(tree[0], targets=False)) == len(before) > 0
-
-
-@pytest.mark.parametrize("box", [[4, 4, 0, 20], [4, 4, 30, 0], [-1, -1, -1, -1]])
-def test_bop_dataset_skips_boxes_without_area(tree, box):
-    before = BOPDataset(tree[0], targets=False)
-    edit(tree, "scene_gt_info.json", lambda content: content["0"][0].update(bbox_obj=box))
-    after = BOPDataset(tree[0], targets=False)
-    assert (len(after), after.skipped["bad_box"]) == (
-        len(before) - 1,
-        before.skipped["bad_box"] + 1,
-    )

@@ -94,7 +94,7 @@ def test_strong_perspective_shows_the_focal_length(wrong):
     assert wrong * float(fit.log_zoom.exp()) == pytest.approx(1.0, abs=0.06)
     assert rotation_error(fit.state.T[0, :3, :3], T[:3, :3]) < 1.5
     information, _ = focal_length.focal_information(fit.problem, fit.state, 2.0)
-    assert float(information.variance.sqrt()) < 0.2
+    assert information.variance.sqrt() < 0.2
 
 
 @pytest.mark.parametrize(

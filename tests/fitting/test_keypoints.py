@@ -293,29 +293,6 @@ def test_boxes_of_keypoints_are_the_first_proposals_less_certain_with_a_rival():
     assert (first, second) == pytest.approx((0.8 * alone, 0.5 * alone))
 
 
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.25, 0.5), (0.4, -0.3)])
-def test_features_lie_where_blobs_are(shift):
-    """Gaussian blobs of known centres: OpenCV's default puts features 0.25 px too far right and
-    down."""
-    axis = torch.arange(256, dtype=torch.float64)
-    random = np.random.default_rng(2)
-    picture = torch.zeros(256, 256, dtype=torch.float64)
-    centres = []
-    for x in range(24, 250, 48):
-        for y in range(24, 250, 48):
-            u = x + shift[0]
-            v = y + shift[1]
-            size = random.uniform(1.5, 6.0)
-            picture += torch.exp(-((axis - u) ** 2 + (axis[:, None] - v) ** 2) / (2 * size**2))
-            centres.append((u, v))
-    found = keypoints_module._Features.of(picture.float()[None], tones=(0.0, 1.0)).uv
-    away = found[:, None] - np.array(centres)
-    nearest = away[np.arange(len(found)), np.linalg.norm(away, axis=2).argmin(axis=1)]
-    nearest = nearest[np.linalg.norm(nearest, axis=1) < 1.5]
-    assert len(nearest) > 25
-    assert np.abs(np.median(nearest, axis=0)).max() < 0.03
-
-
 def test_keypoints_are_where_the_mesh_shows_them():
     """Of several photographs: the median distance in px of matched features from their
     keypoints."""

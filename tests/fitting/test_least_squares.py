@@ -185,8 +185,8 @@ def test_covariance_of_a_cylinder_has_unknown_rotation_about_its_axis(axis_angle
     axis = fit.transform[0, :3, 2]
     # The rim of the near lid, which a silhouette does not show, pulls towards the outline.
     assert float(axis @ T[:3, 2]) > 0.985
-    assert float((axis @ C @ axis).sqrt()) > 1.0
-    assert float(torch.linalg.eigvalsh(C)[0].sqrt()) < 0.2  # other rotations are known
+    assert (axis @ C @ axis).sqrt() > 1.0
+    assert torch.linalg.eigvalsh(C)[0].sqrt() < 0.2  # other rotations are known
 
 
 @pytest.mark.parametrize("unit", [1e-3, 80.0])

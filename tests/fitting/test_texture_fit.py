@@ -73,7 +73,7 @@ def test_label_determines_the_rotation_about_the_axis(renderer, degrees):
     assert (found.transform - TRUTH)[0, :3, 3].norm() < 0.01 * 7.0
     assert int(found.observable) == 6
     about_axis = R[:, 1] @ found.covariance[0, :3, :3] @ R[:, 1]
-    assert float(about_axis.sqrt().rad2deg()) < 10.0
+    assert about_axis.sqrt().rad2deg() < 10.0
 
 
 def test_a_label_is_found_without_red_and_the_last_round_draws_it_finer(renderer):
@@ -163,7 +163,7 @@ def test_label_does_not_pull_a_pose_out_of_its_limits(monkeypatch):
         registrar([photograph(MESH, TRUTH)], box, CAMERA, prior=p)[0] for p in (None, prior)
     )
     assert rotation_error(free.rotation, R) < 1.0
-    assert float(prior.excess(limited.rotation)) <= 3.0
+    assert prior.excess(limited.rotation) <= 3.0
     assert limited.hypotheses[0].covariance is not None, "its contours are fitted"
 
 

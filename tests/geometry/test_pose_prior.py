@@ -49,7 +49,7 @@ def test_azimuth_excess_and_nearest_are_the_least_rotation_into_the_range(elevat
     least = torch.rad2deg((R[2] * grid[..., 2, :]).sum(-1).clamp(-1.0, 1.0).acos()).min()
     assert float(prior.excess(R)) == pytest.approx(float(least), abs=0.3)
     moved = prior.nearest(R)
-    assert float(prior.excess(moved)) <= 1e-4
+    assert prior.excess(moved) <= 1e-4
     assert rotation_error(moved, R) == pytest.approx(float(prior.excess(R)), abs=1e-4)
 
 

@@ -5,8 +5,6 @@ import os
 from dataclasses import replace
 from unittest.mock import Mock
 
-import cv2
-import numpy as np
 import pytest
 import torch
 
@@ -211,35 +209,6 @@ def test_camera_of_names_its_source(entry, monkeypatch, camera, source):
     assert camera_of(stored, photo) == (None, None), "of a dataset"
 
 
-def test_the_camera_of_a_row_comes_before_the_guess_for_all(tmp_path):
-    """And the guess is that of rows without one."""
-    path = tmp_path / "list.csv"
-    path.write_text(
-        "photo,x0,y0,x1,y1,fx,fy,cx,cy\na.png,1,2,30,40,260,260,119.5,89.5\nb.png,1,2,30,40,,,,\n"
-    )
-    first, second = read_list(path, RegisterOptions(meshes=(tmp_path / "part.stl",), guess=50.0))
-    assert first.camera == (260.0, 260.0, 119.5, 89.5)
-    assert second.camera == 50.0
-
-
-def test_the_page_of_a_list_begins_with_the_surest_answers(tmp_path, monkeypatch):
-    pose = {"rotation": torch.eye(3).tolist(), "translation": None, "warnings": [], "message": ""}
-    pose |= {"digests": {"request": "r", "photo": "p"}}
-    rows = {
-        "unlikely": {**pose, "verdict": "unsure", "confidence": 0.1, "reliable": False},
-        "failed": {**pose, "verdict": "failed", "message": "no such file"},
-        "likely": {**pose, "verdict": "unsure", "confidence": 0.95, "reliable": False},
-        "sure": {**pose, "verdict": "reliable", "confidence": 0.92, "reliable": True},
-        "surer": {**pose, "verdict": "reliable", "confidence": 0.99, "reliable": True},
-    }
-    shown = []
-    monkeypatch.setattr(lists, "write_sheet", lambda _, __, entries, **___: shown.extend(entries))
-    entries = [Entry({"photo": name}, name, label=name) for name in rows]
-    lists._write_tables(entries, tmp_path, Mock(read=rows.get))
-    in_order = [one.name for one in sorted(shown, key=lambda one: one.rank)]
-    assert in_order == ["surer", "sure", "likely", "unlikely", "failed"]
-
-
 def test_names_are_in_the_order_of_their_numbers(tmp_path):
     names = [
         "b.png",
@@ -297,11 +266,8 @@ def test_every_copy_of_the_object_has_a_row_and_is_drawn(registrar, entry, tmp_p
         assert row["verdict"] == result.verdict
         assert row["reliable"] == "false"
     assert "2 objects" in (tmp_path / "out" / "index.html").read_text()
-    (picture,) = [
-        pixels
-        for path in (tmp_path / "out" / "thumbnails").iterdir()
-        if (pixels := cv2.imread(str(path))).shape[1] > 1.5 * pixels.shape[0]
-    ]
+    pictures = [cv2.imread(str(path)) for path in (tmp_path / "out" / "thumbnails").iterdir()]
+    (picture,) = [pixels for pixels in pictures if pixels.shape[1] > 1.5 * pixels.shape[0]]
     blue, green, red = np.moveaxis(picture.astype(int), 2, 0)
     outline = green - np.maximum(blue, red) > 80
     middle = picture.shape[1] // 2

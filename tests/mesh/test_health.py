@@ -189,27 +189,6 @@ def test_notes_reach_the_result(tmp_path):
         assert text in repr(result)
 
 
-@pytest.mark.slow
-def test_the_pose_of_a_mesh_far_from_its_origin():
-    """As with coordinates of maps, 7 km away from an object of 35 cm: the pose of the mesh near the
-    origin, moved."""
-    scene = cr.synthetic.demo_scene()
-    views = cr.sample_views(azimuth_step=20, elevations=[10, 30])
-    poses = []
-    for offset in (np.zeros(3), np.array([4.4e3, 5.1e2, 4.6e3])):
-        mesh = trimesh.Trimesh(scene.mesh.vertices + offset, scene.mesh.faces, process=False)
-        bank = cr.ViewBank.build(mesh, views, image_size=64, progress=False)
-        result = cr.Registrar(bank, pipeline=bank.pipeline)(
-            [scene.image], [scene.box], scene.camera_matrix
-        )[0]
-        poses.append(
-            (result.rotation, result.translation.numpy() + result.rotation.numpy() @ offset)
-        )
-    (first, near), (second, far) = poses
-    assert cr.rotation_error(first, second) < 1e-3
-    np.testing.assert_allclose(far, near, atol=1e-6)
-
-
 def test_a_part_of_half_a_percent_is_no_leftover():
     parts = [trimesh.creation.box((1.0, 1.0, 1.0))]
     for side, place in ((0.07, 3.0), (0.02, -3.0)):

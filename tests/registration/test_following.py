@@ -186,23 +186,6 @@ def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
     assert follow(frames[4][0]).confidence > BELIEVED_CONFIDENCE, "tracked from the confirmed pose"
 
 
-@pytest.mark.slow
-def test_dark_frame_keeps_or_doubts_the_pose():
-    """A frame at a third of the brightness is followed, or its confidence falls below what is
-    believed."""
-    frames = sequence(3)
-    follow = Follower(truck_registrar(), CAMERA)
-    follow.start(frames[0][0], frames[0][2])
-    result = follow(frames[1][0] / 3.0)
-    assert (
-        not result.ok
-        or errors(result, frames[1][2])[0] < 5.0
-        or (result.confidence or 0.0) < BELIEVED_CONFIDENCE
-    )
-    after = follow(frames[2][0])
-    assert errors(after, frames[2][2])[0] < 5.0
-
-
 def test_follower_refines_where_tracking_is_doubtful(monkeypatch):
     """The object jumps by 11 degrees and a tenth of its distance."""
     image, _, T = sequence(1)[0]

@@ -39,7 +39,7 @@ def test_every_hypothesis_lies_within_hard_limits(pipeline):
     prior = around(AZIMUTH + 180.0, 40.0)
     result = truck_registrar(**pipeline)(*ONE, prior=prior)[0]
     for hypothesis in result.hypotheses:
-        assert float(prior.excess(hypothesis.rotation)) <= 3.0
+        assert prior.excess(hypothesis.rotation) <= 3.0
     assert result.prior_contradiction == "better outside"
 
 
@@ -48,7 +48,7 @@ def test_each_photograph_has_its_own_prior_which_may_leave_no_view():
     priors = [None, around(AZIMUTH + 180.0, 40.0), PosePrior(elevation=(85, 90), theta=(90, 91))]
     free, limited, failed = registrar([IMAGE] * 3, BOX.repeat(3, 1), CAMERA, prior=priors)
     assert rotation_error(free.rotation, TRUTH) < 5.0
-    assert float(priors[1].excess(limited.rotation)) <= 3.0
+    assert priors[1].excess(limited.rotation) <= 3.0
     assert not failed.ok
     assert "no view of the bank" in str(failed.error)
     with pytest.raises(InvalidInputError, match="prior: expected a PosePrior, or a list of 3"):
@@ -128,7 +128,7 @@ def test_no_hypothesis_exceeds_combined_limits_by_more_than_the_fit_may(seed):
     prior = PosePrior(azimuth=(20.0, 40.0), elevation=(20.0, 40.0), theta=(-40.0, 40.0))
     for registrar, tolerance in ((truck_registrar(contours=False), 0.01), (truck_registrar(), 3.0)):
         for hypothesis in registrar([image], box[None], K, prior=prior)[0].hypotheses:
-            assert float(prior.excess(hypothesis.rotation)) <= tolerance
+            assert prior.excess(hypothesis.rotation) <= tolerance
 
 
 @pytest.mark.parametrize("turned", slow_after(1, [180.0, 120.0]))
@@ -150,8 +150,9 @@ def test_only_rival_outside_tells_whether_a_tight_right_hint_is_wrong(turned):
 DISTANCE = float(T[:3, 3].norm())  # of the origin, which is near the centre
 
 
-@pytest.mark.parametrize("pipeline", [{}, {"contours": False}], ids=str)
-@pytest.mark.parametrize("factors", [(0.5, 0.7), (1.4, 2.0)])
+@pytest.mark.parametrize(
+    ("pipeline", "factors"), [({}, (0.5, 0.7)), ({"contours": False}, (1.4, 2.0))], ids=str
+)
 def test_every_hypothesis_lies_at_an_allowed_distance(pipeline, factors):
     registrar = truck_registrar(**pipeline)
     near, far = (factor * DISTANCE for factor in factors)

@@ -1,4 +1,3 @@
-import math
 import pickle
 from contextlib import nullcontext
 from copy import copy
@@ -19,8 +18,6 @@ from curvireg_torch import (
     sample_views,
 )
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
-from curvireg_torch.evidence import Evidence
-from curvireg_torch.fitting import contour_fit
 from curvireg_torch.geometry import Camera, box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
@@ -29,11 +26,9 @@ from curvireg_torch.registration import (
     FailedRegistration,
     Follower,
     block,
-    hypotheses,
     several,
     stages,
 )
-from curvireg_torch.registration import block as described_module
 from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration.photograph import Photograph, check_crop
 from curvireg_torch.rendering import make_renderer
@@ -123,19 +118,6 @@ def test_a_photograph_without_a_box_among_others_is_refused_and_not_taken_as_a_w
         _ = second.rotation
 
 
-def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
-    fit_poses = block.fit_poses
-    counts = []
-
-    def counted(describer, images, poses, **options):
-        counts.append(len(poses))
-        return fit_poses(describer, images, poses, **options)
-
-    monkeypatch.setattr(block, "fit_poses", counted)
-    assert len(truck_registrar(hypotheses=1)([IMAGE], BOX[None], CAMERA)[0].hypotheses) == 1
-    assert counts == [3, 1], "the best is fitted twice"
-
-
 @pytest.mark.parametrize(
     ("lowered_within", "weight", "right"),
     [
@@ -165,57 +147,6 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
     (result,) = stages.register(registrar, [item], query)
     assert (float(rotation_error(result.rotation, TRUTH[:3, :3])) < 4) == right
     assert len(result.hypotheses) == registrar.pipeline.hypotheses
-
-
-@pytest.mark.parametrize(("shift", "calls"), [(-1.0, 3), (math.inf, 2)])
-def test_starts_have_one_short_fit_and_a_pose_that_stays_is_described_once(
-    monkeypatch, shift, calls
-):
-    """The descriptions: of all poses, of the one that is fitted again if it moves, and of those
-    that merged."""
-    registrar = truck_registrar()
-    short_fit = contour_fit.short_fit
-    fits = []
-    described = []
-    measure = Evidence.measured
-
-    def counted(contours, crops, K, T, *index):
-        fits.append(len(T))
-        return short_fit(contours, crops, K, T, *index)
-
-    def measured(**seen):
-        described.append(len(seen["rank"]))
-        return measure(**seen)
-
-    for module in (contour_fit, hypotheses):
-        monkeypatch.setattr(module, "short_fit", counted)
-    monkeypatch.setattr(Evidence, "measured", measured)
-    monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
-    registrar([IMAGE], BOX[None], CAMERA)
-    assert fits == [FitSettings().screened_views, 1]
-    assert len(described) == calls
-
-
-@pytest.mark.parametrize(("support", "kept"), [(0.0, False), (1.0, True)])
-def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch, support, kept):
-    fit_poses = block.fit_poses
-
-    def pretended(describer, crops, poses, **options):
-        fitted = fit_poses(describer, crops, poses, **options)
-        other = replace(
-            fitted, T=fitted.T + 1e-9, edge_support=torch.full_like(fitted.rank, support)
-        )
-        return other if options.get("refit") else fitted
-
-    def contours(target, described, poses):
-        mine = poses.edge_support == support
-        return torch.where(mine, 2.0 * support, measure(target, described, poses))
-
-    measure = described_module._contours
-    monkeypatch.setattr(block, "fit_poses", pretended)
-    monkeypatch.setattr(described_module, "_contours", contours)
-    result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
-    assert (result.edge_support == support) == kept
 
 
 def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):

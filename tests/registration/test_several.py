@@ -10,7 +10,6 @@ from torch.testing import assert_close
 from curvireg_torch import Registrar, rotation_error, rotation_from_viewpoint
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.mesh import mesh_centre, mesh_radius
-from curvireg_torch.registration import rig as rig_module
 from curvireg_torch.registration.rig import Rig
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 from tests._support.numbers import double, eye, seeded
@@ -53,9 +52,9 @@ def registered(images, boxes, cameras):
 
 def check_pose(result, *, degrees=2.0, shift=0.1):
     """``T_world_from_model`` is right, ``shift`` in radii."""
-    assert float(rotation_error(result.rotation, WORLD[:3, :3])) < degrees
+    assert rotation_error(result.rotation, WORLD[:3, :3]) < degrees
     off = result.translation - WORLD[:3, 3]
-    assert float(off.norm()) < shift * mesh_radius(example_mesh())
+    assert off.norm() < shift * mesh_radius(example_mesh())
 
 
 @pytest.fixture(scope="module")
@@ -75,13 +74,6 @@ def test_pose_in_the_world_and_in_each_photograph(easy):
     assert_close(easy.projection[0], easy.views[0].T_cam_from_model)
     assert easy.confidence > 0.9
     assert len(easy.probabilities) == len(easy.hypotheses) > 1
-
-
-def test_photographs_prefer_a_pose_without_rivals_by_all_points(monkeypatch):
-    monkeypatch.setattr(rig_module, "JUDGED_CANDIDATES", 1)
-    alone = registered(*rig_of(EASY))
-    assert len(alone.hypotheses) == 1
-    assert [view.contribution for view in alone.views] == pytest.approx([5.0] * 3)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +145,7 @@ def test_boxes_may_be_missing():
     )
     check_pose(result, degrees=1.0, shift=0.05)
     assert result.views[1].failure is None
-    assert float((result.views[1].box - boxes[1]).abs().max()) < 8
+    assert (result.views[1].box - boxes[1]).abs().max() < 8
     assert "lies outside" in result.views[3].failure
 
 
@@ -173,7 +165,7 @@ def test_one_photograph_gives_the_answer_of_the_registrar():
     assert_close(R @ result.covariance[3:, 3:] @ R.T, alone.covariance[3:, 3:])
 
 
-def test_covariance_shrinks_with_photographs_but_not_with_copies(easy):
+def test_covariance_shrinks_with_photographs(easy):
     images, boxes, cameras = rig_of(EASY)
     two = registered(images[:2], boxes[:2], cameras[:2])
     deviations = [
@@ -183,10 +175,6 @@ def test_covariance_shrinks_with_photographs_but_not_with_copies(easy):
     largest = torch.linalg.eigvalsh(alone.hypotheses[0].covariance[3:, 3:])[-1].sqrt()
     assert float(deviations[0][-1]) < 0.5 * float(largest)  # the depth is seen from the side
     assert float(deviations[1].prod()) < float(deviations[0].prod())
-    copies = registered(images[:1] * 3, boxes[:1] * 3, cameras[[0, 0, 0]])
-    assert copies.confidence <= alone.confidence + 0.05
-    volumes = [torch.logdet(r.hypotheses[0].covariance) for r in (alone, copies)]
-    assert float(volumes[1] - volumes[0]) > -1.5
 
 
 def test_covariance_grows_where_photographs_contradict_each_other(easy):
@@ -250,10 +238,9 @@ def test_copies_of_a_photograph_are_no_evidence():
     thrice = registered(images[:1] * 3, boxes[:1] * 3, cameras[:1].repeat(3, 1, 1))
     assert thrice.probabilities == pytest.approx(once.probabilities)
     assert torch.equal(thrice.transform, once.transform)
-    assert [view.failure for view in thrice.views] == [
-        None,
-        *["a copy of image 0, which counts once"] * 2,
-    ]
+    assert torch.equal(thrice.hypotheses[0].covariance, once.hypotheses[0].covariance)
+    copy = "a copy of image 0, which counts once"
+    assert [view.failure for view in thrice.views] == [None, copy, copy]
 
 
 def test_rigs_compare_rivals_that_are_not_reported():

@@ -13,10 +13,9 @@ import trimesh
 from curvireg_torch import camera_matrix
 from curvireg_torch.errors import ImageError, LostObjectError
 from curvireg_torch.fitting import regions
-from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.edges import CROP_SIZE
 from curvireg_torch.fitting.flow import Frame, Keyframe, track_points
-from curvireg_torch.fitting.least_squares import INLIER_SCALE, PointMatches, fit_points, pixels
+from curvireg_torch.fitting.least_squares import fit_points, pixels
 from curvireg_torch.fitting.regions import (
     HALF_RATE_COUNT,
     SECTORS,
@@ -143,34 +142,6 @@ def test_each_measurement_alone_moves_the_outline_onto_a_plain_cube(monkeypatch,
     follow.start(drawn(START), K, START)
     assert shift_in_pixels(START, truth) > 3.0
     assert shift_in_pixels(follow.track(drawn(truth), K).state.T[0], truth) < 0.5
-
-
-def test_a_step_follows_edges_the_end_of_the_colours_and_corners(monkeypatch):
-    follow = make_tracker(cube())
-    follow.start(drawn(START), K, START)
-    found = follow.measure(drawn(START), K, moved(START, [0.0, 0.0, 0.01], [0.01, 0.0, 0.0]))
-    state = found.state
-    used = []
-
-    def selected_step(_problem, _points, _uv, J, _radius, equations):
-        used.extend([J, *equations])
-        return torch.zeros(1, 6).double()
-
-    monkeypatch.setattr(ContourProblem, "selected_step", selected_step)
-    model = torch.rand(1, 9, 3, generator=seeded(0)).double() - 0.5
-    uv = pixels(model, START[None], found.frame.K, follow.centre)
-    corners = PointMatches(model, uv, torch.ones(1, 9).double())
-    T = follow._step(found.frame, state, corners, 4.0)
-    assert torch.allclose(T, state.T, atol=1e-12)
-    J, equations = used
-    colours = follow._colours(found.frame, state, J[:, state.points.outline[0]], 4)
-    matches = corners.measurements(state.T, found.frame.K, follow.centre, INLIER_SCALE)
-    for together, one, other in zip(
-        equations, colours.equations(), matches.equations(), strict=True
-    ):
-        assert torch.allclose(together, one + other)
-        assert (one != 0).any()
-        assert (other != 0).any()
 
 
 def test_directions_lead_from_the_centre_of_the_object():

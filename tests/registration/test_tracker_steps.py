@@ -1,20 +1,17 @@
 """The tracker's steps in closed cases: predictions, keyframes, features, what is learned."""
 
 import math
-from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from curvireg_torch.fitting.edges import CROP_SIZE
 from curvireg_torch.fitting.regions import RegionModel, Silhouette
 from curvireg_torch.geometry.framing import boxes_at
 from curvireg_torch.registration import tracking
 from curvireg_torch.registration.tracking import Tracker
-from tests._support.numbers import double, eye
+from tests._support.numbers import double
 from tests.fitting.cube import pose
 
 K = double([[200.0, 0, 99.5], [0, 200.0, 49.5], [0, 0, 1]])
@@ -46,128 +43,11 @@ def test_boxes_of_meshes_outside_the_image_mean_nothing():
         assert boxes_at(HULL, at(z=z), K[None], SIZE)[1].tolist() == [visible], z
 
 
-@dataclass
-class Flow:
-    """A flow measured in a crop with camera ``K``, and its weight."""
-
-    K: Tensor
-    start: str = ""
-    ratio: float = 0.0
-    weight: float = 1.0
-
-    def moved(self, before, after):
-        assert before.equal(self.K)
-        return replace(self, K=after)
-
-    def inlier_ratio(self, *_):
-        return self.ratio
-
-    def scaled(self, weight):
-        return replace(self, weight=weight)
+def flow(ratio):
+    return SimpleNamespace(inlier_ratio=lambda *_: ratio)
 
 
-@dataclass(frozen=True)
-class State:
-    T: Tensor
-    points: Any = None
-
-
-@dataclass
-class Problem:
-    """One whose contours are always, or never, found again."""
-
-    stale: bool
-
-    def state(self, T):
-        return State(T)
-
-    def with_current_contours(self, state):
-        return State(state.T, points="again") if self.stale else state
-
-
-def fitted(
-    monkeypatch,
-    keyframes,
-    last,
-    shift=100.0,
-    *,
-    stale=False,
-    searched=None,
-):
-    """The weighted flows that a fit uses, of the keyframe that is nearest: the second. In the first
-    crop, with a focal length of 1 px, the flow moves the object by a ``shift`` in px. Steps leave a
-    pose that is not quite rigid; their radii in px are ``searched``."""
-    cameras = [double([zoom, zoom, 1.0]).diag()[None] for zoom in (1.0, 2.0)]
-    frames = [SimpleNamespace(K=camera, problem=Problem(stale)) for camera in cameras]
-    used = []
-
-    def track(keyframe, frame, *_, levels):
-        return Flow(frame.K, f"{keyframe.name} {levels}")
-
-    def step(_, state, corners, radius):
-        used[:] = [(flow.weight, flow.start, float(flow.K[0, 0, 0])) for flow in corners]
-        if searched is not None:
-            searched.append(radius)
-        return state.T * torch.tensor([1.01, 1.01, 1.01, 1.0])
-
-    def tracked(frame, state, flows):
-        assert torch.allclose(state.T[:, :3, :3], eye(3))
-        assert state.points == ("again" if stale else None)
-        return float(frame.K[0, 0, 0]), len(flows)
-
-    monkeypatch.setattr(tracking, "track_points", track)
-    monkeypatch.setattr(tracking, "fit_points", lambda *_: at(x=5.0 * shift))
-    monkeypatch.setattr(tracking, "PointMatches", SimpleNamespace(cat_within=list))
-    angles = torch.tensor([9.0, 2.0, 5.0])
-    follow = SimpleNamespace(
-        _last=last,
-        _keyframes=keyframes,
-        _frame=lambda *_: frames.pop(0),
-        _angles=lambda _: angles[: len(keyframes)],
-        _step=step,
-        _tracked=tracked,
-        centre=torch.zeros(3).double(),
-        hull=HULL * torch.tensor([1.0, 1.0, 0.0]),
-    )
-    image = None
-    camera, flows = Tracker._fit(follow, image, K, at())
-    assert camera == used[0][2]
-    assert flows == len(used)
-    return used
-
-
-def named(name):
-    return SimpleNamespace(name=name)
-
-
-def test_a_fit_uses_the_flow_from_the_last_frame_and_from_the_nearest_keyframe(monkeypatch):
-    """Both in the crop of the pose that the flow gives."""
-    keyframes = [named("a"), named("b"), named("c")]
-    last = (tracking.POINT_WEIGHT, f"last {tracking.PYRAMID_LAST}", 2.0)
-    from_keyframe = (tracking.KEYFRAME_WEIGHT, f"b {tracking.PYRAMID_KEYFRAME}", 2.0)
-    assert fitted(monkeypatch, keyframes, named("last")) == [last, from_keyframe]
-    alone = (tracking.POINT_WEIGHT, f"b {tracking.PYRAMID_LAST}", 2.0)
-    assert fitted(monkeypatch, keyframes, keyframes[1]) == [alone]
-
-
-def test_the_crop_of_the_predicted_pose_serves_where_the_flow_moves_it_little(monkeypatch):
-    limit = tracking.WINDOW_SHIFT
-    for sign in (-1.0, 1.0):
-        for shift, camera in ((0.99 * limit, 1.0), (1.01 * limit, 2.0)):
-            used = fitted(monkeypatch, [named("a"), named("b")], named("last"), sign * shift)
-            assert [flow[2] for flow in used] == [camera, camera], sign * shift
-
-
-@pytest.mark.parametrize("stale", [False, True])
-def test_a_round_is_left_out_after_one_that_hardly_moved_the_contours(monkeypatch, stale):
-    first, *between, last = tracking.SEARCH_RADII
-    assert first > last
-    radii = [first, *between, last] if stale else [first, last]
-    fitted(monkeypatch, [named("a")], named("last"), stale=stale, searched=(searched := []))
-    assert searched == [radius for radius in radii for _ in range(tracking.STEPS_PER_ROUND)]
-
-
-def features(mean, variance, flows):
+def features(mean, variance, *flows):
     ends = double(mean), double(variance)
     follow = SimpleNamespace(
         _regions=SimpleNamespace(ends=lambda *_: ends),
@@ -176,27 +56,20 @@ def features(mean, variance, flows):
     )
     problem = SimpleNamespace(edge_support=lambda _: torch.tensor(0.4))
     frame = SimpleNamespace(problem=problem, K=K, bins=None)
-    state = State(at())
-    given = flows
-    return dict(Tracker._tracked(follow, frame, state, given).features)
+    return dict(Tracker._tracked(follow, frame, SimpleNamespace(T=at()), flows).features)
 
 
 def test_features_in_closed_form():
     """A flat posterior has a variance of a third of the radius' square."""
     flat = tracking.REGION_FEATURE_RADIUS**2 / 3.0
-    one, other = Flow(K, ratio=0.8), Flow(K, ratio=0.3)
-    found = features([0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.5 * flat, flat], [one, other])
-    assert found == pytest.approx(
-        {
-            "edge_support": 0.4,
-            "region": (1.0 + math.exp(-0.5) + 0.5) / 4.0,
-            "flow": 0.8,
-            "keyframe": 0.3,
-        }
-    )
-    alone = features([0.0], [2.0 * flat], [one])
+    variances = [0.0, 0.0, 0.5 * flat, flat]
+    found = features([0.0, 2.0, 0.0, 0.0], variances, flow(0.8), flow(0.3))
+    region = (1.0 + math.exp(-0.5) + 0.5) / 4.0
+    expected = {"edge_support": 0.4, "region": region, "flow": 0.8, "keyframe": 0.3}
+    assert found == pytest.approx(expected)
+    alone = features([0.0], [2.0 * flat], flow(0.8))
     assert (alone["region"], alone["flow"], alone["keyframe"]) == (0.0, 0.8, 0.8)
-    none = features([], [], [])
+    none = features([], [])
     assert (none["region"], none["flow"], none["keyframe"]) == (0.0, 0.0, 0.0)
 
 
@@ -223,7 +96,10 @@ def test_starting_again_forgets_what_was_seen(monkeypatch):
     follow = Tracker(contours, HULL)
     monkeypatch.setattr(follow, "_learn", lambda *_: None)
     monkeypatch.setattr(follow, "_remember", lambda *_: follow._keyframes.append(None))
-    poses = {x: SimpleNamespace(state=State(at(x)), frame=SimpleNamespace(K=K)) for x in (0, 1, 3)}
+    poses = {
+        x: SimpleNamespace(state=SimpleNamespace(T=at(x)), frame=SimpleNamespace(K=K))
+        for x in (0, 1, 3)
+    }
     for seen in poses.values():
         given = seen
         follow.accept(given)

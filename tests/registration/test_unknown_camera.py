@@ -16,13 +16,13 @@ from curvireg_torch.fitting.focal_length import (
     scaled_cameras,
 )
 from curvireg_torch.fitting.least_squares import apply_twist
-from curvireg_torch.geometry import Camera, rotation_from_viewpoint, transform
+from curvireg_torch.geometry import Camera
 from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.block import Block
-from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.photograph import Photograph
+from tests._support import hypotheses as support
 from tests._support.hypotheses import evidence_of
 from tests._support.numbers import double
 from tests._support.scenes import CAMERA, SIZE
@@ -32,12 +32,9 @@ CENTRE = double([0.3, -0.2, 0.4])
 BOX = torch.tensor([60.0, 40.0, 180.0, 140.0])
 
 
-def poses_at(count, *, K=CAMERA, rank=None):
+def poses_at(count):
     """Of the views 0, 1, ..., turned about the vertical axis."""
-    R = torch.stack([rotation_from_viewpoint(70.0 * k, 30.0, 0.0).double() for k in range(count)])
-    T = transform(R, double([0.1, 0.0, 5.0]).expand(count, 3))
-    ranks = double(rank or [0.0] * count)
-    return Hypotheses.at(T, K.expand(count, 3, 3), CENTRE, torch.arange(count), ranks)
+    return support.poses_at(*(70.0 * number for number in range(count)), centre=CENTRE)
 
 
 def test_cameras_that_are_tried_have_all_fields_of_view():
@@ -72,35 +69,6 @@ def test_starts_are_the_best_view_of_each_camera_and_the_best_views():
     assert found == sorted(expected, key=lambda place: -float(ranked[place]))
     every = camera_module.best_of_fields(ranked, 4)
     assert sorted((every % 4).tolist()) == [0, 1, 2, 3]
-
-
-@pytest.mark.parametrize(("source", "factors"), [("estimated", [2, 1]), ("exif", [1])])
-def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source, factors):
-    poses = poses_at(1)
-    fitted = []
-
-    def problem(_, __, K, ___, *, factor=1):
-        return SimpleNamespace(factor=factor, K=K, edge_support=lambda _: torch.ones(1))
-
-    def fit(problem, T, *_):
-        fitted.append(problem.factor)
-        zoom = double([0.1])
-        return SimpleNamespace(problem=problem, state=SimpleNamespace(T=T), log_zoom=zoom)
-
-    def measured(_, __, support, ___):
-        return replace(poses.fit, edge_support=support.double())
-
-    monkeypatch.setattr(camera_module.ContourProblem, "of", problem)
-    monkeypatch.setattr(camera_module, "fit_focal_length", fit)
-    monkeypatch.setattr(camera_module, "measured_fit", measured)
-    describer = SimpleNamespace(contours=None, centre=CENTRE)
-    camera = Camera(CAMERA, focal_deviation=0.1, source=source)
-    item = Photograph(torch.zeros(3, *SIZE), BOX, camera)
-    found = camera_module.with_focal_length(describer, NOTHING, poses, item)
-    assert fitted == factors
-    zoom = float(found.cameras[0, 0, 0] / CAMERA[0, 0])
-    assert zoom == pytest.approx(math.exp(0.1 * len(factors)))
-    assert float(found.edge_support) == 1.0
 
 
 def test_the_covariance_is_that_of_the_origin(monkeypatch):

@@ -27,12 +27,6 @@ def images(kind):
 
 
 class TestHistogramOfOrientedGradients:
-    @pytest.mark.parametrize("orientations", [1, 4, 9])
-    @pytest.mark.parametrize("channels", [1, 3])
-    def test_smoke(self, orientations, channels):
-        out = histogram_of_oriented_gradients(torch.rand(1, channels, 32, 32), orientations)
-        assert out.isfinite().all()
-
     @pytest.mark.parametrize(("batch", "height", "width"), [(1, 24, 24), (3, 40, 33)])
     def test_cardinality(self, batch, height, width):
         out = histogram_of_oriented_gradients(torch.rand(batch, 1, height, width))

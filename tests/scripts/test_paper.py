@@ -26,8 +26,7 @@ from scripts._shared import commit, read_json
 from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
-from scripts.paper.measures import Estimate, bootstrap, points_within
-from tests._support.numbers import double
+from scripts.paper.measures import bootstrap, points_within
 from tests._support.scenes import write_photo
 
 SETTINGS = BankSettings(image_size=64)
@@ -129,22 +128,6 @@ def test_chance_and_ceiling_stand_below_precision(views):
         assert means == sorted(means)
 
 
-@pytest.mark.slow
-def test_the_search_says_between_how_many_views_it_searches(views):
-    for record in views:
-        for variant in tables.VARIANTS:
-            for pair in tables.PAIRS:
-                found = record[variant][pair]
-                assert 1 <= found["coherent"] <= 3
-                assert ("wider found" in found) == (pair in tables.SEARCHED_PAIRS)
-                if found["coherent"] > 1 and pair in tables.SEARCHED_PAIRS:
-                    assert found["wider found"] == found["found"]
-        for pair in tables.REFINED_PAIRS:
-            assert len(record["corrected"][pair]["refined"]) == 4
-    (table,) = tables.search_tables(tables.Records(views, "two photographs"))
-    assert len(table.rows) == 9
-
-
 def test_focus_curves_by_threshold_and_precision_by_protocol(root):
     records = measure.measure_focus(find_cases("web", root), SETTINGS, "upright")
     assert set(records[0]["chance"]) == set(tables.PROTOCOLS.values())
@@ -163,33 +146,6 @@ def test_focus_curves_by_threshold_and_precision_by_protocol(root):
     thresholds, protocols = tables.focus_tables(tables.Records(named, "two photographs"))
     assert [row[0] for row in thresholds.rows[:2]] == ["0.0010", "0.0067"]
     assert [row[0] for row in protocols.rows] == list(tables.PROTOCOLS)
-
-
-@pytest.mark.slow
-def test_closest_is_that_of_the_retrieved_views(views):
-    for record in views:
-        for pair in tables.PAIRS:
-            found = record["corrected"][pair]
-            assert len(found["est"]) == len(found["clo"]) == 4
-            least = min(found["top"][:3])
-            apart = [np.radians(x) for x in found["clo"][:3]]
-            assert max(np.degrees(apart)) >= least / 3.0 - 1e-3, (
-                "not closer than the closest of the three"
-            )
-
-
-def test_a_mesh_is_rendered_once():
-    renderer = measure.Remembered(example_mesh())
-    renderer._inner = Mock(wraps=renderer._inner)
-    T = torch.eye(4)[None].repeat(2, 1, 1).double()
-    T[:, 2, 3] = double([1.0, 2.0])
-    K = double([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]]).expand(2, 3, 3)
-    first = renderer.render(T, K, (64, 64))
-    second = renderer.render(T, K, (64, 64))
-    assert torch.equal(first, second)
-    assert renderer._inner.render.call_count == 1
-    assert not torch.equal(renderer.render(T, K, (64, 64), orthographic=True), first)
-    assert renderer._inner.render.call_count == 2
 
 
 def test_bootstrap_resamples_cads():
@@ -347,17 +303,6 @@ def test_the_staircase_leads_from_the_paper_to_the_default_one_change_at_a_time(
         parts = [part for part in names if getattr(before, part) != getattr(after, part)]
         assert len(parts) <= 1, name
     assert replace(steps[-2][1], hypotheses=5, contours=True) == steps[-1][1]
-
-
-def test_the_staircase_shows_what_is_known():
-    share = Estimate(0.625, 0.5, 0.75, 8)
-    of_two_cads = staircase.Score(share, 2, 12.3)
-    of_three = staircase.Score(share, 3, 12.3)
-    text = staircase.table({"lm": {2: of_two_cads, 0: of_three}})
-    assert "| change | `lm`, N 8 |" in text
-    assert "| 2. S_rep monotone | 0.62, 12° |" in text
-    assert "| 0. the paper to the letter | 0.62 (0.50 to 0.75), 12° |" in text
-    assert "| 14. contour fit of five hypotheses: the default | - |" in text
 
 
 def climb(monkeypatch, out, *words):
