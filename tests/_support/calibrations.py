@@ -13,14 +13,7 @@ K = np.array([[520.5, 0.0, 321.25], [0.0, 522.0, 238.5], [0.0, 0.0, 1.0]])
 VGA = (480, 640)
 
 
-def check_camera(
-    camera,
-    distortion,
-    size=VGA,
-    *,
-    matrix=K,
-    model="radial-tangential",
-):
+def check_camera(camera, distortion, size=VGA, *, matrix=K, model="radial-tangential"):
     torch.testing.assert_close(camera.matrix, torch.from_numpy(matrix))
     assert (camera.distortion, camera.size, camera.model) == (distortion, size, model)
 

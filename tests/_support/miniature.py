@@ -42,13 +42,7 @@ def pascal_object(category, **changes):
         "error": np.nan,
         "viewport": 3000.0,
     }
-    entry = {
-        "class": category,
-        "view": "",
-        "truncated": 0,
-        "occluded": 0,
-        "difficult": 0,
-    }
+    entry = {"class": category, "view": "", "truncated": 0, "occluded": 0, "difficult": 0}
     entry |= {"bbox": np.array([[11.0, 6.0, 71.0, 56.0]]), "cad_index": 1}
     entry["anchors"] = {"left_front": {"location": np.empty((0, 0)), "status": 1}}
     viewpoint = changes.pop("viewpoint", {})

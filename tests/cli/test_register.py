@@ -185,8 +185,7 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
         "(leave --unit out, or curvireg bank)",
     )
     refused(
-        register_one("--up=-x", "--no-refine", **bank),
-        "mm.safetensors: built with z up, not -x",
+        register_one("--up=-x", "--no-refine", **bank), "mm.safetensors: built with z up, not -x"
     )
     words = ["--unit", "mm", "--up", "z", "--no-refine"]
     assert register_one(*words, **bank) == 0

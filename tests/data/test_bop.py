@@ -251,9 +251,7 @@ def test_bop_dataset_refuses_poses_in_metres(tree):
         content["0"][0]["cam_t_m2c"] = [value / 1000 for value in content["0"][0]["cam_t_m2c"]]
 
     edit(tree, "scene_gt.json", in_metres)
-    with refused(
-        r"image 0 the mesh is 86\.6 across and 0\.4 away: cam_t_m2c in metres",
-    ):
+    with refused(r"image 0 the mesh is 86\.6 across and 0\.4 away: cam_t_m2c in metres"):
         BOPDataset(tree[0], targets=False)
 
 

@@ -64,9 +64,7 @@ def test_crops_show_the_boxes_with_their_poses_and_classes(tmp_path):
         assert crop["viewpoint_bins"].tolist() == bins
 
 
-def test_objects_of_bop_sets_are_classes_and_those_without_a_box_are_counted(
-    tmp_path,
-):
+def test_objects_of_bop_sets_are_classes_and_those_without_a_box_are_counted(tmp_path):
     write_bop(tmp_path)
     # One scene has no boxes: they are those of the mesh, if it can be read.
     tmp_path.joinpath("models", "obj_000001.ply").write_text("ply")

@@ -149,9 +149,7 @@ def run_command(words, monkeypatch):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_commands_of_a_page_have_the_options_and_blocks_of_python_are_python(
-    page,
-):
+def test_commands_of_a_page_have_the_options_and_blocks_of_python_are_python(page):
     for kind, text in steps(page):
         if kind == "python":
             compile(text, page.name, "exec")
@@ -195,11 +193,7 @@ def test_page_runs(page, monkeypatch, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", FIRST_PAGES, ids=lambda page: page.stem)
 def test_the_first_pages_run_on_the_files_of_the_demo_alone(
-    page,
-    tmp_path,
-    tmp_path_factory,
-    monkeypatch,
-    capsys,
+    page, tmp_path, tmp_path_factory, monkeypatch, capsys
 ):
     """Typed as they stand, in a folder that holds nothing else."""
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))

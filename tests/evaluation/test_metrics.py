@@ -137,9 +137,7 @@ def test_mssd_and_mspd_against_loops(monkeypatch):
         )
 
 
-def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(
-    monkeypatch,
-):
+def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(monkeypatch):
     """Scores of cans with 315 symmetries took minutes."""
     angles = torch.arange(315.0, dtype=torch.float64) * (2 * math.pi / 315)
     symmetries = eye(4).repeat(315, 1, 1)

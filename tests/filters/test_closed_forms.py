@@ -104,9 +104,7 @@ def _camera(focal, size):
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
-def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_unit(
-    unit,
-):
+def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_unit(unit):
     """fx != fy and cx != cy: the normal (point - centre) / radius is differentiated numerically."""
     H = 49
     W = 61

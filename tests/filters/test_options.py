@@ -73,9 +73,7 @@ def test_depth_layers_broadcast_masks():
 
 
 @pytest.mark.parametrize("module", [filters.AverageShadingGradient, filters.ApparentRidges])
-def test_perspective_modules_keep_the_precision_of_their_camera(
-    module,
-):
+def test_perspective_modules_keep_the_precision_of_their_camera(module):
     camera = CAMERA.clone()
     camera[:2, 2] += 1 / 3  # not representable in half precision
     depth = depths().half()

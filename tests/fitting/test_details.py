@@ -64,14 +64,7 @@ def test_the_middle_between_a_contour_and_none_is_half_of_what_shared_contours_h
     assert float(scores[2, 0]) < -1.0
 
 
-def closed_case(
-    monkeypatch,
-    places,
-    *,
-    strength=0.8,
-    padding=None,
-    outside=-1.0,
-):
+def closed_case(monkeypatch, places, *, strength=0.8, padding=None, outside=-1.0):
     """Score of the first of two poses with contour points at ``places`` in px along a line, where
     all edges have a ``strength``; ``padding`` are places of points that are not valid, and at
     ``outside`` the photograph ends."""

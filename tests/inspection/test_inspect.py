@@ -275,10 +275,7 @@ def test_a_print_varies_over_the_surface_and_leaves_the_shape():
 def test_ranges_take_their_last_border_in():
     trial = Trial(tuple(outcome(1.0, elevation=e) for e in (-90.0, 0.0, 45.0, 90.0)), {})
     found = trial.by(lambda each: each.elevation, (-90.0, 0.0, 90.0))
-    assert {name: expected.n for name, expected in found.items()} == {
-        "-90 to 0": 1,
-        "0 to 90": 3,
-    }
+    assert {name: expected.n for name, expected in found.items()} == {"-90 to 0": 1, "0 to 90": 3}
     assert list(trial.by(lambda each: each.elevation, (0.0, math.inf))) == ["0 or more"]
 
 
@@ -440,20 +437,3 @@ def test_a_printed_can_is_predicted_better_with_its_texture_than_without():
         registrar = Registrar(bank, mesh_is="exact", symmetries=torch.eye(4)[None].double())
         right[name] = run_trial(registrar, generate, 6, compare=False).expected.right
     assert right["texture"] > right["grey"] + 0.3
-
-
-def test_clutter_differs_from_photograph_to_photograph(monkeypatch):
-    radii = []
-
-    def recorded(radius, _generator):
-        radii.append(round(radius, 6))
-        return trimesh.creation.icosphere(1, radius)
-
-    monkeypatch.setattr("curvireg_torch.inspection.photographs._random_object", recorded)
-    generate = PhotographGenerator(trimesh.creation.box((1, 2, 3)), 0, clutter=True)
-    first = []
-    for index in range(2):
-        radii.clear()
-        generate(index)
-        first.append(radii[0])
-    assert first[0] != first[1]

@@ -5,6 +5,8 @@ import os
 from dataclasses import replace
 from unittest.mock import Mock
 
+import cv2
+import numpy as np
 import pytest
 import torch
 

@@ -36,10 +36,7 @@ def test_own_files_are_replaced_and_others_beside_them_do_not_matter(tmp_path):
             (tmp_path / "result.json").write_text("{}")
     assert marked(tmp_path) == {"register": {"files": ["result.json"], "source": []}}
     (tmp_path / "pose.glb").write_text("a mesh that came later")
-    with (
-        refused(r"pose\.glb: not written"),
-        output_folder(tmp_path, "register"),
-    ):
+    with refused(r"pose\.glb: not written"), output_folder(tmp_path, "register"):
         pytest.fail("work began")
 
 

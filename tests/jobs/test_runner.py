@@ -172,10 +172,7 @@ def test_only_photographs_with_a_row_are_digested_before_they_are_registered(
         before.append(list(digested))
         return [
             runner.Finished(
-                {
-                    "digests": {"request": task.request, "photo": "unchanged"},
-                    "verdict": "reliable",
-                },
+                {"digests": {"request": task.request, "photo": "unchanged"}, "verdict": "reliable"},
                 None,
             )
             for task in tasks
@@ -239,12 +236,7 @@ ENTRY = Entry(
     {"note": "x"}, "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=CAMERA
 )
 VIEWS = (Entry(name="z.png", photo=Path("z.png"), camera=CAMERA, T_cam_from_world=torch.eye(4)),)
-OTHERS = {
-    "name": "y.png",
-    "instances": 2,
-    "as_stored": True,
-    "views": VIEWS,
-}
+OTHERS = {"name": "y.png", "instances": 2, "as_stored": True, "views": VIEWS}
 OTHERS |= {"prior": PosePrior(distance=(1.0, 2.0)), "start": PoseRecord(np.eye(4))}
 STARTS = (
     PoseRecord(2.0 * np.eye(4)),

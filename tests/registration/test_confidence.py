@@ -17,13 +17,7 @@ from curvireg_torch.registration import confidence
 from curvireg_torch.synthetic import procedural_background
 from tests._support.numbers import double, seeded
 from tests._support.quick import slow_after
-from tests._support.scenes import (
-    CAMERA,
-    SIZE,
-    learned_registrar,
-    scene,
-    truck_registrar,
-)
+from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 
 R30 = sample_views(azimuth_step=12, elevations=[0]).rotations
 

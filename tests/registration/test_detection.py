@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 
 import curvireg_torch as cr
-from curvireg_torch.errors import InvalidInputError, LostObjectError
+from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import (
     PosePrior,
     box_iou,
@@ -18,7 +18,6 @@ from curvireg_torch.geometry import (
     viewpoint_from_rotation,
 )
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
-from curvireg_torch.matching.detector import _medoids
 from curvireg_torch.registration import Detector, Proposals, detect, stages
 from curvireg_torch.registration import detection as detection_module
 from curvireg_torch.registration.detection import RegisteredBox, _add, _allowed_views
@@ -82,8 +81,7 @@ def fixed(boxes, responses):
 
 
 @pytest.mark.parametrize(
-    ("seed", "corner", "scale"),
-    slow_after(1, [(5, (30, 60), 0.6), (7, (40, 10), 1.1)]),
+    ("seed", "corner", "scale"), slow_after(1, [(5, (30, 60), 0.6), (7, (40, 10), 1.1)])
 )
 def test_detected_pose_is_the_true_one(seed, corner, scale):
     """Pasted elsewhere at another scale; the camera of the scene is transformed accordingly."""
@@ -131,6 +129,18 @@ def test_detect_finds_several_instances(registrar):
     assert torch.equal(results[0].detection.boxes[:2], boxes)
     with refused("instances: expected >= 1, got 0"):
         detect(registrar, [image], instances=0)
+
+
+def test_detect_reports_an_object_once(registrar, monkeypatch):
+    """Two proposals lead to the same truck, and two instances are requested."""
+    image, box = pasted_scene(5, (60, 40), 0.9)
+    side = (box[2:] - box[:2]).max()
+    beside = torch.stack([box - 0.36 * side, box + 0.36 * side])
+    assert box_iou(beside[:1], beside[1:]) < 0.5, "distinct proposals"
+    monkeypatch.setattr(registrar, "detector", fixed(beside, [9.0, 8.0]))
+    monkeypatch.setattr(detection_module, "projected_box", lambda *_: box.double())
+    (result,) = detect(registrar, [image], instances=2)[0]
+    assert torch.equal(result.detection.box, box.double())
 
 
 def test_the_most_certain_of_all_proposals_is_reported(registrar, found, monkeypatch):
@@ -324,12 +334,6 @@ def test_smallest_size(shape, least):
     assert 80.0 / max(scales) == pytest.approx(least)
 
 
-def test_medoids_are_the_centres_of_clusters():
-    points = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 5.2, 9.0, 9.1, 9.2])[torch.randperm(9)]
-    medoids = _medoids((points[:, None] - points).square(), 3)
-    assert sorted(points[medoids].tolist()) == pytest.approx([0.1, 5.1, 9.1])
-
-
 @pytest.mark.parametrize(("score", "kept"), [(0.2, [0.9, 0.3]), (0.5, [0.9, 0.3]), (0.95, [0.95])])
 def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_each(score, kept):
     def at(x0, score):
@@ -341,26 +345,6 @@ def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_ea
     assert [one.score for one in found] == kept
     _add(found, at(40.0, 0.1))  # elsewhere
     assert [one.score for one in found] == [*kept, 0.1]
-
-
-def test_boxes_around_poses_are_registered_where_they_are_more_certain(
-    registrar, found, monkeypatch
-):
-    """Of those around which the object is outside the photograph nothing supports the pose."""
-    ones = [as_found(found[2]) for _ in range(3)]
-    others = [as_found(found[2])]
-    again = [replace(ones[0], score=ones[0].score - 0.01), InvalidInputError("outside")]
-    again.append(replace(ones[2], score=ones[2].score + 0.01))
-    asked = []
-    monkeypatch.setattr(detection_module, "_scored", lambda *_: again)
-    monkeypatch.setattr(
-        detection_module, "_registered", lambda *args: asked.append(args[2]) or others
-    )
-    best = detection_module._refined(registrar, {0: Photograph(found[0], found[1], None)}, ones)
-    assert best[0] is ones[0]
-    assert best[1].score == 0.0
-    assert best[2] is others[0]
-    assert asked == [[again[2]]]
 
 
 def test_photographs_are_searched_together_as_alone(registrar, found, monkeypatch):
@@ -379,33 +363,6 @@ def test_photographs_are_searched_together_as_alone(registrar, found, monkeypatc
                 assert one.confidence == pytest.approx(other.confidence, abs=0.01)
             else:
                 assert str(one.error) == str(other.error).replace("image 0", f"image {number}")
-
-
-def test_places_of_one_object_leave_room_for_others(monkeypatch):
-    """Two of them lead to the same object; a third one takes the place of the second."""
-    boxes = torch.tensor(
-        [[0.0, 0, 10, 10], [20.0, 0, 30, 10], [40.0, 0, 50, 10], [60.0, 0, 70, 10]]
-    )
-    where = [boxes[0], boxes[0], boxes[2], boxes[3]]
-    asked = []
-
-    def registered(_target, _photographs, some):
-        asked.append([one.response for one in some])
-        at = [RegisteredBox(**{**vars(one), "registration": None}) for one in some]
-        return [replace(one, box=where[int(9 - one.response)]) for one in at]
-
-    monkeypatch.setattr(RegisteredBox, "probability", property(lambda one: one.score))
-    monkeypatch.setattr(detection_module, "_registered", registered)
-    monkeypatch.setattr(detection_module, "_refined", lambda _target, _photographs, some: some)
-    monkeypatch.setattr(
-        detection_module,
-        "_scored",
-        lambda _target, _photographs, some: [replace(one, score=one.response / 10) for one in some],
-    )
-    proposals = Proposals(boxes, torch.tensor([9.0, 8, 7, 6]), torch.zeros(4, dtype=torch.long))
-    found = detection_module._register_candidates(None, {}, {0: proposals}, 2)
-    assert asked == [[9.0, 8.0], [7.0]]
-    assert [one.score for one in found[0]] == [0.9, 0.7]
 
 
 def test_scores_are_relative_to_the_view_elsewhere_in_the_photograph():

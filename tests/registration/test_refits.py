@@ -44,13 +44,7 @@ class Refits:
         details = torch.ones_like(evidence.details)
         return replace(poses, evidence=replace(evidence, details=details))
 
-    def run(
-        self,
-        poses,
-        evidence,
-        outside=None,
-        symmetries=None,
-    ):
+    def run(self, poses, evidence, outside=None, symmetries=None):
         """Which poses moved, and the evidence."""
         target = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), pipeline=Pipeline())
         block = SimpleNamespace(
@@ -69,13 +63,7 @@ class Refits:
         # a score of 2.5 is 0.25 of similarity
         ((0, 90, 180, 270), (0.7, 0.9, 0.66, 0.64), None, [[1], [0, 2]], [0, 2]),
         # the second rival is nearly the first, the fifth too many
-        (
-            (0, 90, 95, 180, 270),
-            (0.9, 0.85, 0.84, 0.83, 0.82),
-            None,
-            [[0], [1, 3]],
-            [1, 2, 3, 4],
-        ),
+        ((0, 90, 95, 180, 270), (0.9, 0.85, 0.84, 0.83, 0.82), None, [[0], [1, 3]], [1, 2, 3, 4]),
         # one outside the limits is neither the best nor a rival
         ((0, 90, 180), (0.95, 0.9, 0.85), [True, False, False], [[1], [2]], [2]),
     ],

@@ -22,13 +22,7 @@ from curvireg_torch.geometry import Camera, box_iou, rotation_from_viewpoint, tr
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS, FitSettings
-from curvireg_torch.registration import (
-    FailedRegistration,
-    Follower,
-    block,
-    several,
-    stages,
-)
+from curvireg_torch.registration import FailedRegistration, Follower, block, several, stages
 from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration.photograph import Photograph, check_crop
 from curvireg_torch.rendering import make_renderer

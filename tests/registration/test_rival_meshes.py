@@ -127,9 +127,7 @@ def test_without_probabilities_the_higher_score_decides():
     one = replace(result_of(0.8, 0.9), probabilities=())
     other = result_of(0.5, 0.9)
     other = replace(
-        other,
-        probabilities=(),
-        hypotheses=tuple(replace(h, score=0.9) for h in other.hypotheses),
+        other, probabilities=(), hypotheses=tuple(replace(h, score=0.9) for h in other.hypotheses)
     )
     assert best(one, other).mesh_index == 1
     assert best(one, one).mesh_index == 0

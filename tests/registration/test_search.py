@@ -105,13 +105,7 @@ class Scattered(Peak):
         return torch.where(far, -0.6, super().scores(views))
 
 
-def searched(
-    *truth,
-    camera="perspective",
-    frame="own",
-    kind=Peak,
-    least_coherent=1,
-):
+def searched(*truth, camera="perspective", frame="own", kind=Peak, least_coherent=1):
     """Error of the rotation in degrees and distance in radii that the search finds on a bank of
     neighbours, and the matcher."""
     mesh = trimesh.creation.box((1, 2, 3))

@@ -89,16 +89,7 @@ class FakeRig:
         return SimpleNamespace(number=m, similarity=float(mean.similarity[m]))
 
 
-def joint(
-    monkeypatch,
-    found,
-    scores,
-    *,
-    missing=None,
-    vote=None,
-    count=5,
-    pipeline=None,
-):
+def joint(monkeypatch, found, scores, *, missing=None, vote=None, count=5, pipeline=None):
     FakeRig.scores = scores
     FakeRig.missing = missing or {}
     FakeRig.vote = vote or {}

@@ -10,11 +10,7 @@ import torch
 from torch.testing import assert_close
 
 from curvireg_torch.evidence import EvidenceWeights
-from curvireg_torch.geometry import (
-    rotation_from_axis_angle,
-    rotation_from_viewpoint,
-    transform,
-)
+from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint, transform
 from curvireg_torch.registration import judging
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import Siblings

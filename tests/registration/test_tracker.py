@@ -200,19 +200,6 @@ def test_pose_outside_the_image_is_lost():
         follow.start(drawn(START), K, behind)
 
 
-def test_frames_from_other_directions_become_keyframes():
-    """The sequence turns by 4 degrees a frame: every second is another keyframe."""
-    frames = sequence(10)
-    follow = make_tracker(example_mesh())
-    follow.start(frames[0][0], CAMERA, frames[0][2])
-    for image, _, T in frames[1:]:
-        follow.accept(follow.measure(image, CAMERA, T))
-    angles = [
-        float(rotation_error(k.T[0, :3, :3], frames[0][2][:3, :3])) for k in follow._keyframes
-    ]
-    assert angles == pytest.approx([0.0, 8.02, 16.04, 24.06, 32.09], abs=0.05)
-
-
 def test_posterior_is_that_of_bayes():
     ratio = double([[0.3, -0.2, 0.9, -1.1, 0.4]])
     # ends at -1.5, -0.5, 0.5, 1.5

@@ -6,8 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from curvireg_torch.fitting.edges import CROP_SIZE
-from curvireg_torch.fitting.regions import RegionModel, Silhouette
+from curvireg_torch.fitting.regions import RegionModel
 from curvireg_torch.geometry.framing import boxes_at
 from curvireg_torch.registration import tracking
 from curvireg_torch.registration.tracking import Tracker
@@ -146,35 +145,6 @@ def test_frames_from_other_directions_are_kept(monkeypatch, angle, kept):
 def test_so_many_keyframes_are_kept(monkeypatch):
     latest = [float(x) for x in range(40 - tracking.MAX_KEYFRAMES, 40)]
     assert remembered(monkeypatch, 90.0, 40) == latest
-
-
-def test_colours_are_learned_on_both_sides_of_the_outline():
-    """Lines across the left border of an object that fills the right half of the crop."""
-    depth = torch.zeros(1, 1, CROP_SIZE, CROP_SIZE)
-    depth[..., 128:] = 5.0
-    learned = []
-
-    outline = Silhouette(
-        torch.tensor([[128.0, 90.0]]).expand(3, 2),
-        torch.tensor([[-1.0, 0.0]]).expand(3, 2),
-        torch.zeros(3),
-    )
-
-    def learn(_, samples, __, inside):
-        learned.extend([samples[..., 0].flatten(), inside.flatten()])
-
-    follow = SimpleNamespace(_silhouette=lambda *_: outline, _regions=SimpleNamespace(learn=learn))
-    frame = SimpleNamespace(bins=None)
-    state = None
-    Tracker._learn(follow, frame, state, depth)
-    x, inside = learned
-    band = tracking.LEARNED_BAND
-    count = len(band)
-    assert len(x) == 3 * 2 * count
-    assert int(inside.sum()) == 3 * count
-    assert (inside == (x > 128)).all()
-    assert float((x - 128.0).abs().min()) == min(band)
-    assert float((x - 128.0).abs().max()) == max(band)
 
 
 def test_lines_along_which_colours_say_nothing_do_not_count():

@@ -10,11 +10,7 @@ from torch.testing import assert_close
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evidence import EvidenceWeights
-from curvireg_torch.fitting.focal_length import (
-    USUAL_FOCAL,
-    FocalInformation,
-    scaled_cameras,
-)
+from curvireg_torch.fitting.focal_length import USUAL_FOCAL, FocalInformation, scaled_cameras
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import Camera
 from curvireg_torch.geometry.cameras import point_in_cameras
@@ -96,14 +92,7 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
     assert_close(covariance[0], variance * expected[:, None] * expected, atol=1e-6, rtol=1e-4)
 
 
-def refitted(
-    monkeypatch,
-    evidence,
-    new,
-    *,
-    tried_cameras,
-    outside=None,
-):
+def refitted(monkeypatch, evidence, new, *, tried_cameras, outside=None):
     """Views that were fitted with their focal lengths, those that changed, and the evidence."""
     poses = poses_at(len(evidence))
     tried = []

@@ -9,12 +9,7 @@ import torch
 import trimesh
 
 from curvireg_torch.geometry import transform
-from curvireg_torch.rendering.contours import (
-    MAX_OCCLUDING,
-    MeshContours,
-    _Places,
-    _Views,
-)
+from curvireg_torch.rendering.contours import MAX_OCCLUDING, MeshContours, _Places, _Views
 from tests._support.numbers import double
 
 SIZE = 128

@@ -114,9 +114,7 @@ def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails(
         )
 
 
-def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(
-    monkeypatch,
-):
+def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(monkeypatch):
     used = []
     level = contours_module.MeshContours._level
 

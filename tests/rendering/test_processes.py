@@ -53,8 +53,7 @@ for backend in sys.argv[1:]:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 @pytest.mark.parametrize(
-    ("backends", "codes"),
-    slow_after(1, [(["auto", "embree"], ["0", "0"]), (["pyrender"], ["3"])]),
+    ("backends", "codes"), slow_after(1, [(["auto", "embree"], ["0", "0"]), (["pyrender"], ["3"])])
 )
 def test_renderers_after_a_fork(backends, codes):
     """embree and OpenCV work in the child; OpenGL cannot, and the error says what to do."""

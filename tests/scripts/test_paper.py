@@ -16,10 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvireg_torch.geometry import (
-    camera_matrix,
-    rotation_from_viewpoint,
-)
+from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from scripts._shared import commit, read_json

@@ -148,9 +148,7 @@ def test_finite_numbers_accepts_finite_numbers_only():
 
 
 @pytest.mark.parametrize("digest", [files.tensor_digest, files.tensor_checksum])
-def test_tensor_digest_depends_on_name_dtype_shape_and_values(
-    digest,
-):
+def test_tensor_digest_depends_on_name_dtype_shape_and_values(digest):
     x = torch.arange(4.0)
     others = [
         {"b": x},
