@@ -30,6 +30,8 @@ class LayerCase:
     constant_gives_zero: bool = True
     min_size: int = 1
     accepts_colour: bool = True
+    is_variant: bool = False
+    """Another option of a case before: its tests are slow ones."""
 
     def __call__(self, x):
         return self.function(x, **self.options)
@@ -68,7 +70,11 @@ class LayerContract:
 
     def pytest_generate_tests(self, metafunc):
         if "case" in metafunc.fixturenames:
-            metafunc.parametrize("case", self.cases, ids=[case.name for case in self.cases])
+            slow = {False: (), True: pytest.mark.slow}
+            cases = [
+                pytest.param(case, id=case.name, marks=slow[case.is_variant]) for case in self.cases
+            ]
+            metafunc.parametrize("case", cases)
 
     def agrees(self, got, want):
         """Equality of compiled results: another order of summation flips single pixels at a

@@ -13,3 +13,8 @@ def eye(n):
 
 def seeded(seed):
     return torch.Generator().manual_seed(seed)
+
+
+def uniform(*shape, seed=0):
+    """Random numbers in [0, 1)."""
+    return torch.rand(*shape, generator=seeded(seed), dtype=torch.float64)

@@ -6,6 +6,21 @@ from curvireg_torch import Registration
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration import Hypothesis
 
+FEATURES = {
+    "similarity": 0.7,
+    "margin": 0.1,
+    "edge_support": 0.6,
+    "contours": 0.4,
+    "ranking_share": 0.3,
+    "keypoints": 0.0,
+    "unmatched": 0.0,
+    "undetermined": 1.2,
+    "outside": 0.0,
+    "border": 0.0,
+    "focal": 0.0,
+}
+"""Of an answer that is likely, and not certain."""
+
 
 def registration(covariance=None, confidence=0.9, detection=None):
     """A registration to a bank of two views, the second of which one term did not compare."""

@@ -7,7 +7,13 @@ import cv2
 import torch
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix, sample_views
-from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
+from curvireg_torch.geometry import (
+    rotation_error,
+    rotation_from_axis_angle,
+    rotation_from_viewpoint,
+    transform,
+)
+from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration.result import Detection
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
@@ -41,12 +47,20 @@ def scene(seed):
     return image, box, T
 
 
+def seen_from(mesh, azimuth, elevation, radii):
+    """(4, 4) pose of a mesh whose centre lies straight ahead, so many of its radii away."""
+    R = rotation_from_viewpoint(azimuth, elevation, 0.0).double()
+    ahead = double([0.0, 0.0, radii * mesh_radius(mesh)])
+    return transform(R, ahead - R @ mesh_centre(mesh))
+
+
 def errors(result, T):
     """Degrees, and the error of the position as a fraction of the distance."""
     away = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
     return float(rotation_error(result.rotation, T[:3, :3])), away
 
 
+@cache
 def sequence(count):
     """Photographs, boxes and poses: 4 degrees about a vertical axis and 2 % nearer from frame to
     frame."""

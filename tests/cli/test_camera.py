@@ -11,7 +11,6 @@ import curvireg_torch as cr
 from curvireg_torch import Camera, Registration, camera_matrix
 from curvireg_torch.cli import main
 from curvireg_torch.cli.register import NONE_RELIABLE, SOME_FAILED
-from curvireg_torch.data import images
 from curvireg_torch.errors import InvalidInputError
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, check_pose, lines, written
@@ -133,26 +132,6 @@ def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, registe
     assert found["inputs"]["box"] != [float(v) for v in box]
     assert np.array(found["T_cam_from_model"])[:3, 3].tolist() == found["translation"]
     assert "frame_id: camera_optical_frame" in (tmp_path / "out" / "pose.yaml").read_text()
-
-
-@pytest.mark.parametrize(("banks", "located"), [(1, True), (2, True), (2, False)])
-def test_a_photograph_is_decoded_and_undistorted_once(
-    banks, located, folder, lens, register, monkeypatch
-):
-    opened = []
-    planes = []
-    decode = images.decoded
-    remap = cv2.remap
-    monkeypatch.setattr(
-        images, "decoded", lambda path, *how: opened.append(path) or decode(path, *how)
-    )
-    monkeypatch.setattr(cv2, "remap", lambda x, *a, **k: planes.append(x) or remap(x, *a, **k))
-    words = ["--mesh", folder / "truck.safetensors"] * banks
-    words += ["--box", *lens[0]] if located else []
-    words += ["--camera", folder / "cam.json"]
-    assert register(folder / "distorted.png", *words) == 0
-    assert opened == [folder / "distorted.png"]
-    assert len(planes) == 3  # red, green and blue
 
 
 def test_lists_take_calibration_files_and_masks(folder, lens, tmp_path):

@@ -13,7 +13,6 @@ from curvireg_torch import Registrar, ViewBank, camera_matrix
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.register import _advice, _print_rivals, _write_pose, print_result
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
-from curvireg_torch.matching import list_cache
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, box_of, check_pose
@@ -291,22 +290,6 @@ def test_starts_of_other_tools_have_their_convention_and_unit(
     torch.testing.assert_close(double(document()["translation"]), T[:3, 3], rtol=0.1, atol=0.05)
     with pytest.raises(SystemExit):
         register_one("--start-convention", "opengl")
-
-
-def test_a_command_with_another_unit_renders_no_views_again(
-    tmp_path, register_one, document, monkeypatch
-):
-    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
-    views = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
-    pipeline = tmp_path / "few.json"
-    pipeline.write_text(replace(PRESETS["classical"], views=views).to_json())
-    words = ["--no-refine", "--pipeline", str(pipeline)]
-    assert register_one(*words, mesh="truck.ply") == 0
-    assert document()["unit"] == "m"
-    monkeypatch.setattr(ViewBank, "build", None)  # would fail
-    assert register_one(*words, "--unit", "ft", mesh="truck.ply") == 0
-    assert document()["unit"] == "ft"
-    assert len(list_cache()) == 1
 
 
 def test_register_refines_a_start_or_writes_that_the_object_is_lost(

@@ -8,7 +8,7 @@ import trimesh
 
 from curvireg_torch import Camera, rotation_error
 from curvireg_torch.cli import main, parse
-from curvireg_torch.errors import InvalidInputError, RenderingError
+from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
 from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Registrar
@@ -208,15 +208,16 @@ def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_fi
     assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("custom", 0.0)
 
 
-def test_evaluate_keeps_the_views_of_the_preset_paper(pascal, evaluate):
-    settings = evaluate(
-        "pascal3d", pascal.root, "--categories", "car", "--limit", "1", "--preset", "paper"
-    )["settings"]
+def test_evaluate_keeps_the_views_of_the_preset_paper(pascal, evaluate, tmp_path, monkeypatch):
+    """Which take seconds to render: no mesh is read here."""
+    broken = Mock(side_effect=MeshError("broken"))
+    monkeypatch.setattr("curvireg_torch.evaluation.datasets.cached_bank", broken)
+    with pytest.raises(InvalidInputError, match="nothing was scored"):
+        evaluate("pascal3d", pascal.root, "--preset", "paper")
+    settings = json.loads((tmp_path / "out" / "summary.json").read_text())["settings"]
     assert (settings["preset"], settings["protocol"].split()[1]) == ("paper", "pose=upright")
-    assert (settings["pipeline"]["views"]["pose"], settings["pipeline"]["views"]["frame"]) == (
-        "paper",
-        "principal",
-    )
+    views = settings["pipeline"]["views"]
+    assert (views["pose"], views["frame"]) == ("paper", "principal")
 
 
 def test_evaluate_bop_assumes_any_pose(bop, evaluate):

@@ -104,6 +104,7 @@ def _case(name, options):
         constant_gives_zero=kind not in ("diffusion", "blur", "hog"),
         min_size=8 if kind == "hog" else 1,
         accepts_colour=kind != "diffusion",
+        is_variant=name in ("cs-paper-length", "diffusion-exponential", "mfc-alone"),
     )
 
 

@@ -8,6 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from curvireg_torch import filters
+from curvireg_torch.filters.focus import MODES
 from tests._support.numbers import double, seeded
 
 from .layer_cases import cylinder, grid, plane, sphere
@@ -190,13 +191,14 @@ def test_depth_layers_ignore_noise_of_one_ulp(field, distance):
     assert ((a * b).sum(dim=1).abs().sum() / (a.norm() * b.norm())) > 0.9999
 
 
-def test_multiscale_focus_curves_leave_weak_edges_out():
-    """CS is a square: of the strongest edge's contrast, a tenth gives .01 and a quarter .06."""
-    x, _ = grid(161)
-    strong, quarter, tenth = (torch.erf((x - c) / (2.0 * math.sqrt(2.0))) for c in (-50.0, 0, 50.0))
-    image = (0.5 + 0.3 * strong + 0.075 * quarter + 0.03 * tenth)[None, None]
-    default = filters.multiscale_focus_curves(image)[0, :, 80].norm(dim=0)
-    every = filters.multiscale_focus_curves(image, threshold=0.001)[0, :, 80].norm(dim=0)
-    assert [bool(default[i] > 0) for i in (30, 80, 130)] == [True, True, False]
-    assert (every[[30, 80, 130]] > 0).all()
-    assert_close(default[[30, 80]], every[[30, 80]])
+@pytest.mark.parametrize("angle", [0.0, 15.0, 30.0, 45.0, 60.0])
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("blur", [1.0, 1.5, 2.0, 3.0, 4.0])
+def test_edge_blur_in_all_directions(angle, mode, blur):
+    """At the middle of a blurred step, whose normal has the angle."""
+    x, y = grid(81)
+    across = math.cos(math.radians(angle)) * x + math.sin(math.radians(angle)) * y
+    edge = 0.5 * (1.0 + torch.erf(across / (blur * math.sqrt(2.0))))
+    estimates = filters.edge_blur(edge[None, None], mode=mode)[0, :, 40, 40]
+    assert estimates.tolist() == pytest.approx([blur] * 4, rel=0.015)
+    assert (estimates > 0.999 * blur).all()  # the focus 1/s does not exceed 1/blur

@@ -15,29 +15,30 @@ from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.rendering.contours import ContourPoints
-from tests._support.numbers import double, eye, seeded
+from tests._support.numbers import double, eye, seeded, uniform
 from tests.fitting.cube import K, fitted, pose, silhouette
 
-ZERO = torch.zeros(3, dtype=torch.float64)
+ZERO = double([0.0, 0.0, 0.0])
+CAMERAS = K[None]
+AHEAD = pose([0.0, 0.0, 0.0], [0.0, 0.0, 6.0])[None]
+TINY = torch.full((6,), 1e-7, dtype=torch.float64)
+"""Not zero, where the angle of an axis-angle vector is not differentiable."""
 
 
 def test_project_and_its_derivative():
-    points = torch.rand(1, 7, 3, dtype=torch.float64)
-    normals = torch.rand(1, 7, 2, dtype=torch.float64)
+    points = uniform(1, 7, 3)
+    normals = uniform(1, 7, 2)
     T = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None]
     centre = double([0.4, 0.5, 0.6])
 
     def moved(step):
-        uv, _ = ls.project(points, normals, ls.apply_twist(T, step[None], centre), K[None], centre)
+        uv, _ = ls.project(points, normals, ls.apply_twist(T, step[None], centre), CAMERAS, centre)
         return (uv * normals).sum(dim=-1)[0]
 
-    # Not at zero, where the angle of an axis-angle vector is not differentiable.
-    expected = torch.autograd.functional.jacobian(
-        moved, torch.full((6,), 1e-7, dtype=torch.float64)
-    )
-    uv, derivative = ls.project(points, normals, T, K[None], centre)
+    expected = torch.autograd.functional.jacobian(moved, TINY)
+    uv, derivative = ls.project(points, normals, T, CAMERAS, centre)
     assert_close(uv[0], project_points(points[0], T[0], K))
-    assert_close(ls.pixels(points, T, K[None], centre), uv)
+    assert_close(ls.pixels(points, T, CAMERAS, centre), uv)
     assert_close(derivative[0], expected, rtol=1e-4, atol=1e-3)
 
 
@@ -52,11 +53,10 @@ def test_project_and_its_derivative():
 def test_long_steps_are_shortened(rotation, translation, fraction):
     """Translations are given as fractions of the distance of the centre, which lies half a unit
     behind the origin."""
-    T = pose([0.0, 0.0, 0.0], [0.0, 0.0, 6.0])[None]
     centre = double([0.0, 0.0, 0.5])
     step = double([[*rotation, *(6.5 * t for t in translation)]])
-    A = eye(6)[None]
-    assert_close(ls.least_squares_step(A, step[..., None], T, centre, 0.0), fraction * step)
+    found = ls.least_squares_step(eye(6)[None], step[..., None], AHEAD, centre, 0.0)
+    assert_close(found, fraction * step)
 
 
 def test_damping_shortens_each_direction_alike():
@@ -67,46 +67,44 @@ def test_damping_shortens_each_direction_alike():
 
 
 def test_points_need_a_minimum_of_matches():
-    T = pose([0.0] * 3, [0.0, 0.0, 6.0])[None]
     truth = pose([0.02, 0.0, 0.01], [0.05, 0.0, 6.1])[None]
-    points = torch.rand(1, 20, 3, generator=seeded(0), dtype=torch.float64) - 0.5
-    uv = ls.pixels(points, truth, K[None], ZERO)
-    for count, expected in ((ls.MIN_MATCHES - 1, T), (ls.MIN_MATCHES, truth)):
+    points = uniform(1, 20, 3) - 0.5
+    uv = ls.pixels(points, truth, CAMERAS, ZERO)
+    for count, expected in ((ls.MIN_MATCHES - 1, AHEAD), (ls.MIN_MATCHES, truth)):
         weight = (torch.arange(20) < count).double()[None]
-        found = ls.fit_points(ls.PointMatches(points, uv, weight), T, K[None], ZERO, [8.0] * 8)
+        matches = ls.PointMatches(points, uv, weight)
+        found = ls.fit_points(matches, AHEAD, CAMERAS, ZERO, [8.0] * 8)
         assert_close(found, expected, rtol=0, atol=1e-6)
 
 
 def test_inlier_ratio_counts_all_points():
-    T = pose([0.0] * 3, [0.0, 0.0, 6.0])[None]
-    points = torch.rand(1, 10, 3, dtype=torch.float64) - 0.5
-    uv = ls.pixels(points, T, K[None], ZERO)
+    points = uniform(1, 10, 3) - 0.5
+    uv = ls.pixels(points, AHEAD, CAMERAS, ZERO)
+    uv[:, :2] += 500.0
+    uv[:, 2, 0] += 2.0
     weight = torch.ones(1, 10)
-    uv[:, :2], uv[:, 2] = uv[:, :2] + 500.0, uv[:, 2] + torch.tensor([2.0, 0.0])
     weight[:, 3:5] = 0.0  # not found
-    ratio = ls.PointMatches(points, uv, weight).inlier_ratio(T, K[None], ZERO)
+    ratio = ls.PointMatches(points, uv, weight).inlier_ratio(AHEAD, CAMERAS, ZERO)
     assert ratio == pytest.approx((5 + 0.25) / 10, abs=1e-4)
 
 
 def test_matches_are_measured_along_x_and_y_of_the_image():
     """Of three points, one 0.5 px too far to the right in the image, and one 1 px too low."""
     T = pose([0.1, 0.2, 0.0], [0.0, 0.0, 6.0])[None]
-    points = torch.rand(1, 3, 3, generator=seeded(0)).double() - 0.5
-    uv = ls.pixels(points, T, K[None], ZERO)
+    points = uniform(1, 3, 3) - 0.5
+    uv = ls.pixels(points, T, CAMERAS, ZERO)
     uv[0, 0, 0] += 0.5
     uv[0, 2, 1] += 1.0
-    weight = double([[1.0, 0.5, 1.0]])
-    matches = ls.PointMatches(points, uv, weight)
-    found = matches.measurements(T, K[None], ZERO, 2.0)
-    expected = double([0.5, 0.0, 0.0, 0.0, 0.0, 1.0])
-    assert_close(found.distance.flatten(), expected)
+    matches = ls.PointMatches(points, uv, double([[1.0, 0.5, 1.0]]))
+    found = matches.measurements(T, CAMERAS, ZERO, 2.0)
+    assert_close(found.distance.flatten(), double([0.5, 0.0, 0.0, 0.0, 0.0, 1.0]))
     robust = double([(1 + 1 / 16) ** -2, 0.5, (1 + 1 / 4) ** -2])
     assert_close(found.weight.flatten(), robust.repeat_interleave(2))
-    scaled = matches.scaled(0.3).measurements(T, K[None], ZERO, 2.0)
+    scaled = matches.scaled(0.3).measurements(T, CAMERAS, ZERO, 2.0)
     assert_close(scaled.weight, 0.3 * found.weight)
     for row, axis in ((2, (1.0, 0.0)), (3, (0.0, 1.0))):
         normal = double(axis).expand(1, 1, 2)
-        _, J = ls.project(points[:, 1:2], normal, T, K[None], ZERO)
+        _, J = ls.project(points[:, 1:2], normal, T, CAMERAS, ZERO)
         assert_close(found.J[:, row], J[:, 0])
 
 
@@ -127,26 +125,29 @@ def cloud(count):
     normals = F.normalize(
         torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1
     )
-    _, J = ls.project(model, normals, T, K[None], centre)
+    _, J = ls.project(model, normals, T, CAMERAS, centre)
     everywhere = torch.ones(1, count, dtype=torch.bool)
     return ContourPoints(model, normals, everywhere, everywhere), T, centre, J
+
+
+def covariance_of(points, T, centre, J, d, W, radius=1.7):
+    """The covariance of a pose from distances ``d`` and weights ``W``, and the known directions."""
+    measured = ls.Measurements(J, d, W)
+    return ls.pose_covariance(measured, points, T, CAMERAS, centre, radius=radius)
 
 
 def test_covariance_in_closed_form():
     """Directly in (w, e), from autograd's derivative of R = exp([w]x) R0, t = t0 + e."""
     points, T, centre, J = cloud(60)
-    generator = seeded(1)
-    W, d = (torch.rand(1, 60, 1, generator=generator, dtype=torch.float64) for _ in range(2))
-    C, known = ls.pose_covariance(ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
+    W, d = uniform(2, 1, 60, 1, seed=1)
+    C, known = covariance_of(points, T, centre, J, d, W)
     assert int(known) == 6
 
     def moved(step):
         R = rotation_from_axis_angle(step[None, :3])[0] @ T[0, :3, :3]
         return project_points(points.model[0], transform(R, T[0, :3, 3] + step[3:]), K)
 
-    derivative = torch.autograd.functional.jacobian(
-        moved, torch.full((6,), 1e-7, dtype=torch.float64)
-    )
+    derivative = torch.autograd.functional.jacobian(moved, TINY)
     rows = (points.normals[0, :, None] @ derivative)[:, 0]
     w = W[0]
     r = d[0]
@@ -165,12 +166,8 @@ def test_covariance_in_closed_form():
 
 @pytest.mark.parametrize(("factor", "known"), [(0.95, False), (1.05, True)])
 def test_covariance_needs_a_minimum_of_weight(factor, known):
-    points, T, centre, J = cloud(60)
-    W = torch.full((1, 60, 1), factor * 0.1, dtype=torch.float64)
     d = torch.full((1, 60, 1), 0.1, dtype=torch.float64)
-    C, directions = ls.pose_covariance(
-        ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7
-    )
+    C, directions = covariance_of(*cloud(60), d, factor * d)
     assert bool(C.isfinite().all()) == bool(directions > 0) == known
 
 
@@ -196,18 +193,14 @@ def test_covariance_follows_the_unit_of_the_mesh(unit, across):
     points, T, centre, J = cloud(60)
     if across:
         points = replace(points, normals=double([1.0, 0.0]).expand(1, 60, 2))
-        _, J = ls.project(points.model, points.normals, T, K[None], centre)
-    generator = seeded(1)
-    W, d = (torch.rand(1, 60, 1, generator=generator, dtype=torch.float64) for _ in range(2))
-    C, known = ls.pose_covariance(ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
+        _, J = ls.project(points.model, points.normals, T, CAMERAS, centre)
+    W, d = uniform(2, 1, 60, 1, seed=1)
+    C, known = covariance_of(points, T, centre, J, d, W)
     scaled = T.clone()
     scaled[:, :3, 3] *= unit
     S = double([1.0, 1.0, 1.0, unit, unit, unit])
     larger = replace(points, model=unit * points.model)
-    measured = ls.Measurements(J / S, d, W)
-    found, directions = ls.pose_covariance(
-        measured, larger, scaled, K[None], unit * centre, radius=1.7 * unit
-    )
+    found, directions = covariance_of(larger, scaled, unit * centre, J / S, d, W, 1.7 * unit)
     assert int(directions) == int(known) == (6 if not across else int(known))
     assert int(known) < 6 or not across
     assert_close(found / S[:, None] / S, C, rtol=1e-4, atol=1e-9)
@@ -219,13 +212,11 @@ def test_directions_are_known_where_errors_of_points_and_normals_tell_less(radiu
     change in the derivatives."""
     points, T, centre, J = cloud(60)
     W = torch.full((1, 60, 1), 0.5, dtype=torch.float64)
-    _, known = ls.pose_covariance(
-        ls.Measurements(J, W, W), points, T, K[None], centre, radius=radius
-    )
+    _, known = covariance_of(points, T, centre, J, W, W, radius)
     small = 1e-6
     n = points.normals
     turned = n + small * torch.stack([-n[..., 1], n[..., 0]], dim=-1)
-    _, by_normal = ls.project(points.model, turned, T, K[None], centre)
+    _, by_normal = ls.project(points.model, turned, T, CAMERAS, centre)
     seen = (points.model @ T[:, :3, :3].mT + T[:, None, :3, 3])[0]
     ray = F.normalize(seen, dim=-1)
     arms = (points.model[0] - centre) @ T[0, :3, :3].T

@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import PosePrior, object_frame
-from tests._support.numbers import eye, seeded
+from tests._support.numbers import eye, uniform
 from tests._support.refusals import refused
 
 
@@ -16,7 +16,7 @@ def rotations(azimuth, elevation=0.0, theta=0.0):
 
 
 def random_rotations(count):
-    a, e, t = torch.rand(3, count, generator=seeded(0), dtype=torch.float64)
+    a, e, t = uniform(3, count)
     return rotations(360.0 * a, 160.0 * e - 80.0, 360.0 * t - 180.0)
 
 

@@ -118,16 +118,6 @@ def test_result_is_shown_in_ten_lines_and_in_notebooks(result):
     assert result.T_cam_from_model[:3, 3].equal(result.translation)
 
 
-def test_a_bank_has_the_unit_and_the_axis_that_are_given(folder):
-    photo = folder / "photos" / "0.png"
-    bank = folder / "learned.safetensors"
-    for given in ({"unit": "mm"}, {"up": "y"}):
-        with pytest.raises(cr.errors.BankError, match=r"learned\.safetensors: built with"):
-            cr.register(photo, bank, **given)
-        with pytest.raises(cr.errors.InvalidInputError, match="unit, up: of a mesh file"):
-            cr.register(photo, learned_registrar(), **given)
-
-
 def test_every_copy_is_drawn_and_saved(tmp_path, monkeypatch):
     image, boxes = two_trucks()
     registrar = learned_registrar()

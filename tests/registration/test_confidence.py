@@ -17,6 +17,7 @@ from curvireg_torch.registration import confidence
 from curvireg_torch.synthetic import procedural_background
 from tests._support.numbers import double, seeded
 from tests._support.quick import slow_after
+from tests._support.results import FEATURES
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 
 R30 = sample_views(azimuth_step=12, elevations=[0]).rotations
@@ -93,15 +94,7 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
     assert set(model["weights"]) == set(confidence.CONFIDENCE_FEATURES)
     assert all(model["weights"][name] >= 0.0 for name in confidence.EVIDENCE_FEATURES)
     assert all(model["weights"][name] <= 0.0 for name in confidence.DOUBT_FEATURES)
-    tied = {
-        "similarity": 0.7,
-        "margin": 0.0,
-        "edge_support": 0.5,
-        "contours": 0.4,
-        "ranking_share": 0.3,
-        "keypoints": 1.0,
-    }
-    tied |= {"unmatched": 1.0, "undetermined": 0.5, "outside": 0.1, "border": 1.0, "focal": 0.1}
+    tied = {**FEATURES, "margin": 0.0}
     decisive = ("similarity", "edge_support") if exact else ("similarity",)
     for name in decisive:
         more = confidence.probability_of_any({**tied, name: tied[name] + 0.1}, exact=exact)

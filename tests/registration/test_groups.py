@@ -16,23 +16,10 @@ from curvireg_torch.visualization.contours import AXIS
 from curvireg_torch.visualization.overlay import contour_overlay, registration_sheet
 from tests._support.canisters import canister
 from tests._support.numbers import double
-from tests._support.results import registration
+from tests._support.results import FEATURES, registration
 from tests._support.scenes import CAMERA
 from tests.registration.test_ties import hollow_box, photograph, registrar_of
 
-FEATURES = {
-    "similarity": 0.7,
-    "margin": 0.1,
-    "edge_support": 0.6,
-    "contours": 0.4,
-    "ranking_share": 0.3,
-    "keypoints": 0.0,
-    "unmatched": 0.0,
-    "undetermined": 1.2,
-    "outside": 0.0,
-    "border": 0.0,
-    "focal": 0.0,
-}
 UPRIGHT = RoundAxis(double([0.0, 0.0, 1.0]), torch.zeros(3).double(), False)
 
 

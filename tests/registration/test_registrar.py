@@ -18,9 +18,9 @@ from curvireg_torch import (
     sample_views,
 )
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
-from curvireg_torch.geometry import Camera, box_iou, rotation_from_viewpoint, transform
+from curvireg_torch.geometry import Camera, box_iou
 from curvireg_torch.matching import distinct_views
-from curvireg_torch.mesh import mesh_centre, mesh_radius
+from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import FailedRegistration, Follower, block, several, stages
 from curvireg_torch.registration import photograph as photograph_module
@@ -34,6 +34,7 @@ from tests._support.scenes import (
     errors,
     learned_registrar,
     scene,
+    seen_from,
     truck_bank,
     truck_registrar,
     unrefined,
@@ -299,8 +300,7 @@ def test_hypotheses_that_merge_are_put_back_and_come_last():
     images = []
     boxes = []
     for azimuth in AZIMUTHS:
-        R = rotation_from_viewpoint(azimuth, 20.0, 0.0).double()
-        T = transform(R, torch.tensor([0.0, 0.0, 3.5 * mesh_radius(mesh)]) - R @ mesh_centre(mesh))
+        T = seen_from(mesh, azimuth, 20.0, radii=3.5)
         image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(1))
         images.append(image)
         boxes.append(box)

@@ -1,6 +1,7 @@
 """The preset "paper": its stages, and its search between coherent views."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import pytest
@@ -209,6 +210,16 @@ def paper_registrar(**changes):
     return Registrar(truck_bank().mesh, pipeline=replace(PRESETS["paper"], **changes))
 
 
+@cache
+def paper_bank():
+    """The views of the truck in the preset "paper", and the stages that were shown."""
+    shown = []
+    bank = ViewBank.build(
+        truck_bank().mesh, pipeline=PRESETS["paper"], progress=lambda *x: shown.append(x[0])
+    )
+    return bank, shown
+
+
 def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
     def refused(*_, **__):
         raise AssertionError("not a stage of the paper")
@@ -225,13 +236,12 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
     monkeypatch.setattr(KeypointMatches, "agreeing", refused)
     monkeypatch.setattr(Appearance, "build", refused)
     monkeypatch.setattr(Registrar, "object_mask", refused)
+    bank, stages_of_bank = paper_bank()
     shown = []
-    bank = ViewBank.build(
-        truck_bank().mesh, pipeline=PRESETS["paper"], progress=lambda *x: shown.append(x[0])
-    )
     image, box, _ = scene(0)
     result = Registrar(bank, progress=lambda *x: shown.append(x[0]))([image], box[None], CAMERA)[0]
-    assert list(dict.fromkeys(shown)) == ["bank", "ranking", "search"]
+    assert set(stages_of_bank) == {"bank"}
+    assert list(dict.fromkeys(shown)) == ["ranking", "search"]
     assert list(result.ranking.terms) == ["hog", "repeatability"]
     assert len(result.hypotheses) == 1
     assert result.confidence is None
@@ -256,11 +266,9 @@ def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh
     turn = rotation_from_viewpoint(70.0, 25.0, 40.0).double()
     T = eye(4)
     T[:3, :3] = turn
-    mesh = truck_bank().mesh
-    copy = replace(mesh, surface=mesh.surface.copy().apply_transform(T.numpy()))
-    one, other = (
-        ViewBank.build(m, pipeline=PRESETS["paper"], progress=False) for m in (mesh, copy)
-    )
+    one, _ = paper_bank()
+    copy = replace(one.mesh, surface=one.mesh.surface.copy().apply_transform(T.numpy()))
+    other = ViewBank.build(copy, pipeline=PRESETS["paper"], progress=False)
     assert_close(other.rotations.double() @ turn, one.rotations.double(), rtol=0, atol=1e-5)
     in_frame = one.rotations.double() @ principal_rotation(one.mesh).T
     assert_close(in_frame, paper_views().rotations.double(), rtol=0, atol=1e-5)

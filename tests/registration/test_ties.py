@@ -9,14 +9,14 @@ import torch
 import trimesh
 
 from curvireg_torch import Registrar, ViewBank, sample_views
-from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint, transform
-from curvireg_torch.mesh import mesh_centre, mesh_radius, mesh_symmetries
+from curvireg_torch.geometry import rotation_error
+from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from curvireg_torch.registration.target import MAX_SIBLINGS, spread, telling_symmetries
 from curvireg_torch.synthetic import synthesize_photograph
-from tests._support.numbers import double, eye, seeded
+from tests._support.numbers import eye, seeded
 from tests._support.quick import slow_after
-from tests._support.scenes import CAMERA, SIZE
+from tests._support.scenes import CAMERA, SIZE, seen_from
 
 
 @cache
@@ -52,11 +52,8 @@ def registrar_of(mesh, **options):
 
 def photograph(mesh, azimuth, elevation, seed):
     """(3, H, W), its box (4,) and the true ``T_cam_from_model``."""
-    generator = seeded(seed)
-    R = rotation_from_viewpoint(azimuth, elevation, 0.0).double()
-    ahead = double([0.0, 0.0, 5.0 * mesh_radius(mesh)])
-    T = transform(R, ahead - R @ mesh_centre(mesh))
-    return (*synthesize_photograph(mesh, T, CAMERA, SIZE, generator), T)
+    T = seen_from(mesh, azimuth, elevation, radii=5.0)
+    return (*synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(seed)), T)
 
 
 def registered(registrar, azimuth, elevation, seed):

@@ -1,7 +1,7 @@
 """Cameras that are tried and focal lengths that are fitted, in closed cases."""
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -10,13 +10,12 @@ from torch.testing import assert_close
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evidence import EvidenceWeights
-from curvireg_torch.fitting.focal_length import USUAL_FOCAL, FocalInformation, scaled_cameras
+from curvireg_torch.fitting.focal_length import USUAL_FOCAL, FocalInformation
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import Camera
 from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import camera as camera_module
-from curvireg_torch.registration.block import Block
 from curvireg_torch.registration.photograph import Photograph
 from tests._support import hypotheses as support
 from tests._support.hypotheses import evidence_of
@@ -150,29 +149,6 @@ def test_fits_also_begin_from_the_focal_length_of_another_pose():
     assert starts.tolist() == pytest.approx([500.0, 550.0, 650.0, 350.0, 650.0, 500.0, 500.0])
     alone = torch.tensor([2])
     assert camera_module._focal_starts(alone, focal_lengths)[0].tolist() == [2]
-
-
-def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(monkeypatch):
-    poses = poses_at(3)
-    poses = replace(
-        poses,
-        cameras=scaled_cameras(poses.cameras, double([0.0, 0.1, 0.2])),
-        covariance=torch.ones(3, 6, 6, dtype=torch.float64),
-    )
-    best = torch.full((1, 6, 6), 2.0, dtype=torch.float64)
-    monkeypatch.setattr(camera_module, "focal_covariance", lambda *_: (best, 0.07))
-    target = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), describer=None)
-    item = Photograph(torch.zeros(3, *SIZE), BOX, Camera(CAMERA, focal_deviation=0.1))
-    given = {field.name: None for field in fields(Block)}
-    block = Block(**given | {"photographs": [item]})
-    outside = torch.tensor([False, False, True])
-    before = replace(poses, evidence=evidence_of(0.7, 0.8, 0.9), is_outside=outside)
-    block, after = camera_module.with_focal_deviation(target, block, NOTHING, before)
-    (photograph,) = block.photographs
-    assert photograph.focal_deviation == 0.07
-    assert torch.equal(photograph.K, poses.cameras[1])
-    assert after.covariance[[0, 2]].isnan().all()
-    assert torch.equal(after.covariance[1], best[0])
 
 
 def test_limits_of_an_unknown_camera_are_wider_by_how_far_the_box_is_off_the_axis(monkeypatch):

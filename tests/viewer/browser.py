@@ -53,8 +53,19 @@ class Browser:
         self.driver.get(address)
         self.wait(lambda: self.part("register"), "the page")
 
+    def find(self, selector):
+        return self.driver.find_element("css selector", selector)
+
     def part(self, name):
-        return self.driver.find_element("css selector", f'[data-testid="{name}"]')
+        return self.find(f'[data-testid="{name}"]')
+
+    def script(self, code, *arguments):
+        return self.driver.execute_script(code, *arguments)
+
+    def mouse(self):
+        from selenium.webdriver import ActionChains
+
+        return ActionChains(self.driver)
 
     def text(self, name):
         return self.part(name).get_attribute("value") or self.part(name).text
@@ -78,13 +89,19 @@ class Browser:
                 raise AssertionError(f"{what}; page says {said}; {error}")
             time.sleep(0.1)
 
+    def shows(self, name, text):
+        self.wait(lambda: self.text(name) == text, f"{name}: {text}")
+
+    def begins(self, name, text):
+        self.wait(lambda: self.text(name).startswith(text), f"{name}: {text}...")
+
     def click(self, name):
         button = self.part(name)
-        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
+        self.script("arguments[0].scrollIntoView({block: 'center'})", button)
         self.wait(lambda: button.click() or True, f"click {name}", 20)
 
     def unfold(self, name):
-        self.driver.execute_script("arguments[0].open = true", self.part(f"fold-{name}"))
+        self.script("arguments[0].open = true", self.part(f"fold-{name}"))
 
     def upload(self, what, *paths):
         self.part(f"upload-{what}").send_keys("\n".join(map(str, paths)))
@@ -101,7 +118,7 @@ class Browser:
             for (const type of ["dragover", "drop"])
               document.querySelector("footer, main").dispatchEvent(
                 new DragEvent(type, {dataTransfer: transfer, bubbles: true, cancelable: true}))"""  # noqa: E501
-        self.driver.execute_script(script, files)
+        self.script(script, files)
 
     def emulate(self, width, height, *, dark=False):
         """Show the page as a screen of that size does, until it is called with a width of 0."""
@@ -131,11 +148,9 @@ class Browser:
                 self.driver.execute_cdp_cmd(
                     "Input.dispatchMouseEvent", {"type": "mouseMoved", "x": 1, "y": 1}
                 )
-                self.driver.execute_script("document.activeElement.blur(); scrollTo(0, 0)")
+                self.script("document.activeElement.blur(); scrollTo(0, 0)")
                 if part and end == "-phone":
-                    self.driver.execute_script(
-                        "arguments[0].scrollIntoView({block: 'end'})", self.part(part)
-                    )
+                    self.script("arguments[0].scrollIntoView({block: 'end'})", self.part(part))
                 time.sleep(1)
                 pixels = cv2.imdecode(
                     np.frombuffer(self.driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR
@@ -151,7 +166,7 @@ class Browser:
         from selenium.webdriver import ActionChains
 
         image = self.part("photograph")
-        self.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", image)
+        self.script("arguments[0].scrollIntoView({block: 'center'})", image)
         zoom = image.size["width"] / size
         middle = image.size["width"] / 2, image.size["height"] / 2
         (x0, y0), (x1, y1) = (
@@ -182,7 +197,7 @@ class Browser:
             const y = drawn.map(k => Math.floor(k / canvas.width));
             const box = [least(x), least(y), -least(x.map(v => -v)), -least(y.map(v => -v))];
             return box.map(v => v * arguments[0] / canvas.width)"""  # noqa: E501
-        return self.driver.execute_script(script, width)
+        return self.script(script, width)
 
     def box(self):
         facts = self.text("box-facts")

@@ -31,11 +31,11 @@ def _own_screen(browser):
     """A test that fails leaves no small screen, and none begins scrolled down."""
     yield
     browser.emulate(0, 0)
-    browser.driver.execute_script("scrollTo(0, 0)")
+    browser.script("scrollTo(0, 0)")
 
 
 def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browser):
-    assert browser.driver.find_element("css selector", "html").get_attribute("lang") == "en-US"
+    assert browser.find("html").get_attribute("lang") == "en-US"
     assert [browser.text(name) for name in ("sample", "register")] == [
         "Try the sample",
         "Find the pose",
@@ -44,10 +44,7 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
     browser.emulate(1440, 900)
     browser.picture("viewer-empty")
     browser.click("sample")
-    browser.wait(
-        lambda: browser.text("photograph-facts").startswith("coffee.jpg: 600 x 400 px"),
-        "photograph",
-    )
+    browser.begins("photograph-facts", "coffee.jpg: 600 x 400 px")
     assert "CC0" in browser.text("photograph-facts")
     browser.wait(lambda: "done" in browser.part("step-box").get_attribute("class"), "box")
     browser.wait(lambda: not browser.part("register").get_attribute("disabled"), "ready")
@@ -57,15 +54,11 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
 def hinted_azimuth(browser):
     """Say that it looks like this; returns the azimuth of the prior."""
     browser.click("looks-like-this")
-    browser.wait(
-        lambda: browser.text("prior-facts").startswith("Pose prior: seen from azimuth"), "hint"
-    )
+    browser.begins("prior-facts", "Pose prior: seen from azimuth")
     return float(re.search(r"azimuth ([\d.]+)", browser.text("prior-facts"))[1])
 
 
 def test_the_model_turned_with_the_mouse_is_a_hint(browser):
-    from selenium.webdriver import ActionChains
-
     browser.emulate(1440, 900)
     browser.unfold("command-line")
     canvas = browser.wait(
@@ -74,14 +67,14 @@ def test_the_model_turned_with_the_mouse_is_a_hint(browser):
     labels = """
         const all = [...document.querySelectorAll('.nicegui-scene div')];
         return all.filter(e => !e.children.length && e.textContent).map(e => e.textContent)"""
-    browser.wait(lambda: {"up", "front"} <= set(browser.driver.execute_script(labels)), "axes")
+    browser.wait(lambda: {"up", "front"} <= set(browser.script(labels)), "axes")
     before = hinted_azimuth(browser)
     assert f"--near {before:g} " in browser.text("command")
-    ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(
+    browser.mouse().move_to_element(canvas).click_and_hold().move_by_offset(
         45, 0
     ).release().perform()
     browser.wait(lambda: 20 < (before - hinted_azimuth(browser)) % 360 < 120, "turned")
-    ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(
+    browser.mouse().move_to_element(canvas).click_and_hold().move_by_offset(
         -45, 20
     ).release().perform()
     browser.wait(
@@ -91,11 +84,8 @@ def test_the_model_turned_with_the_mouse_is_a_hint(browser):
     browser.click("no-prior")
     browser.wait(lambda: "--near" not in browser.text("command"), "no hint")
     browser.click("mark-front")
-    browser.wait(
-        lambda: browser.text("prior-facts") == "Click on the side that is front.",
-        "asked for the front",
-    )
-    ActionChains(browser.driver).move_to_element_with_offset(canvas, -22, 0).click().perform()
+    browser.shows("prior-facts", "Click on the side that is front.")
+    browser.mouse().move_to_element_with_offset(canvas, -22, 0).click().perform()
     browser.wait(lambda: "Click" not in browser.text("prior-facts"), "clicked")
 
 
@@ -111,14 +101,14 @@ then a search ends sooner than a driver under load looks twice."""
 
 
 def test_a_search_can_be_stopped_and_started_again(browser):
-    browser.driver.execute_script(STOP_ONCE_IT_RUNS)
+    browser.script(STOP_ONCE_IT_RUNS)
     browser.click("register")
     browser.wait(lambda: browser.messages() == ["stopped"], "stopped")
     browser.wait(lambda: not browser.part("stop").is_displayed(), "nothing to stop")
     browser.click("register")
-    browser.wait(lambda: browser.text("progress") == "done", "result")
+    browser.shows("progress", "done")
     assert browser.messages() == []
-    seconds = [text for text in browser.driver.execute_script("return window.shown") if text]
+    seconds = [text for text in browser.script("return window.shown") if text]
     assert seconds.count("0 s") > 1, "of both searches"
     assert all(re.fullmatch(r"\d+ s", text) for text in seconds)
 
@@ -200,18 +190,15 @@ def test_the_pose_is_corrected_on_the_photograph(browser):
 
 
 def scroll(browser, element, amount):
-    from selenium.webdriver import ActionChains
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
 
-    ActionChains(browser.driver).scroll_from_origin(
-        ScrollOrigin.from_element(element), 0, amount
-    ).perform()
+    browser.mouse().scroll_from_origin(ScrollOrigin.from_element(element), 0, amount).perform()
 
 
 def test_the_program_is_copied(browser):
     permissions = {"permissions": ["clipboardReadWrite", "clipboardSanitizedWrite"]}
     browser.driver.execute_cdp_cmd("Browser.grantPermissions", permissions)
-    browser.driver.find_element("css selector", ".verdict [data-copy=python]").click()
+    browser.find(".verdict [data-copy=python]").click()
     script = "navigator.clipboard.readText().then(arguments[0], arguments[0])"
     copied = browser.driver.execute_async_script(script)
     assert copied.startswith("import curvireg_torch as cr\n")
@@ -222,27 +209,23 @@ def test_the_program_is_copied(browser):
 
 
 def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(browser):
-    from selenium.webdriver import ActionChains
-
     browser.emulate(1440, 900)
     before = browser.text("certainty")
     canvas = browser.part("preview").find_element("css selector", "canvas")
     start = hinted_azimuth(browser)
-    browser.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
-    drag = (
-        ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(120, 0)
-    )
+    browser.script("arguments[0].scrollIntoView({block: 'center'})", canvas)
+    drag = browser.mouse().move_to_element(canvas).click_and_hold().move_by_offset(120, 0)
     drag.release().perform()  # half the height is half a turn
     browser.wait(lambda: 140 < (start - hinted_azimuth(browser)) % 360 < 220, "seen from behind")
     browser.click("register")
-    browser.wait(lambda: browser.text("progress") == "done", "contradicted")
+    browser.shows("progress", "done")
     browser.wait(lambda: browser.part("turn-the-prior-around"), "repair")
     assert browser.text("verdict") != "reliable"
     browser.click("turn-the-prior-around")
-    browser.wait(lambda: browser.text("verdict") == "reliable", "the right way round")
+    browser.shows("verdict", "reliable")
     browser.click("no-prior")
     browser.click("register")
-    browser.wait(lambda: browser.text("progress") == "done", "as before")
+    browser.shows("progress", "done")
     browser.wait(lambda: browser.text("certainty") == before, "as before")
     assert browser.messages() == []
 
@@ -250,16 +233,14 @@ def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(brow
 @pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
 def test_the_photograph_fits_the_window_and_stays_in_view(browser, size):
     browser.emulate(*size)
-    viewport = browser.driver.find_element("css selector", ".viewport")
+    viewport = browser.find(".viewport")
     inside = """
         const frame = arguments[0].getBoundingClientRect();
         return frame.top >= 0 && frame.left >= 0 && frame.bottom <= innerHeight && frame.right <= innerWidth"""  # noqa: E501
     for end in (0, 300, 100000):
-        browser.driver.execute_script("scrollTo(0, arguments[0])", end)
-        browser.wait(
-            lambda: browser.driver.execute_script(inside, viewport), f"in view at {end}", 5
-        )
-    assert browser.driver.execute_script("return scrollY") > 300
+        browser.script("scrollTo(0, arguments[0])", end)
+        browser.wait(lambda: browser.script(inside, viewport), f"in view at {end}", 5)
+    assert browser.script("return scrollY") > 300
     assert viewport.rect["width"] > 0.5 * size[0]
 
 
@@ -269,10 +250,10 @@ def test_a_small_screen_stacks_everything_and_dark_colours_follow_the_system(bro
         const all = [...document.querySelectorAll('*:not(.preview *)')];
         return all.filter(e => e.getBoundingClientRect().right > 391)"""
     browser.wait(
-        lambda: browser.driver.execute_script("return document.documentElement.scrollWidth") == 390,
+        lambda: browser.script("return document.documentElement.scrollWidth") == 390,
         "narrow",
     )
-    assert browser.driver.execute_script(wide) == []
+    assert browser.script(wide) == []
     parts = [
         browser.part(name).rect
         for name in ("photograph", "step-photograph", "step-mesh", "register", "verdict")
@@ -288,24 +269,24 @@ def test_a_small_screen_stacks_everything_and_dark_colours_follow_the_system(bro
         }).map(e => e.outerHTML.slice(0, 200))"""  # noqa: E501
     for fold in ("options", "camera", "command-line", "model"):
         browser.unfold(fold)
-    assert browser.driver.execute_script(small) == [], "fingers need 44 px"
+    assert browser.script(small) == [], "fingers need 44 px"
     browser.emulate(1440, 900, dark=True)
-    body = browser.driver.find_element("css selector", "body")
+    body = browser.find("body")
     browser.wait(
         lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark"
     )
 
 
 def test_keys_undo_and_zoom_change_the_box(browser):
-    from selenium.webdriver import ActionChains, Keys
+    from selenium.webdriver import Keys
 
     browser.click("mode-box")
     x0, y0, x1, y1 = browser.box()
-    viewport = browser.driver.find_element("css selector", ".viewport")
+    viewport = browser.find(".viewport")
 
     def press(key, *held):
-        browser.driver.execute_script("arguments[0].focus()", viewport)
-        chain = ActionChains(browser.driver)
+        browser.script("arguments[0].focus()", viewport)
+        chain = browser.mouse()
         for name in held:
             chain.key_down(name)
         chain.send_keys(key)
@@ -323,7 +304,7 @@ def test_keys_undo_and_zoom_change_the_box(browser):
     press("z", Keys.CONTROL)
     becomes(x0 + 1, y0, x1 + 1, y1)
     browser.click("no-box")
-    browser.wait(lambda: browser.text("register") == "Find the object and its pose", "no box")
+    browser.shows("register", "Find the object and its pose")
     assert browser.text("progress") == "the inputs have changed since this answer"
     browser.click("undo")
     becomes(x0 + 1, y0, x1 + 1, y1)
@@ -337,8 +318,8 @@ def test_keys_undo_and_zoom_change_the_box(browser):
     width = image.size["width"]
     scroll(browser, image, -300)
     browser.wait(lambda: image.size["width"] > 1.5 * width, "zoomed")
-    assert browser.driver.execute_script("return arguments[0].scrollLeft", viewport) > 100
-    browser.driver.find_element("css selector", "[data-zoom=fit]").click()
+    assert browser.script("return arguments[0].scrollLeft", viewport) > 100
+    browser.find("[data-zoom=fit]").click()
     browser.wait(lambda: image.size["width"] == width, "as before")
     browser.drag((10, 250), (120, 350), 600)
     browser.wait(lambda: browser.box() == pytest.approx([10, 250, 120, 350], abs=2), "drawn box")
@@ -348,10 +329,8 @@ def test_keys_undo_and_zoom_change_the_box(browser):
 
 def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(browser, folder):
     browser.drop(folder / "truck.ply", folder / "photo.png")
-    browser.wait(
-        lambda: browser.text("photograph-facts") == "photo.png: 240 x 180 px", "photograph"
-    )
-    browser.wait(lambda: browser.text("mesh-facts").startswith("truck.ply: "), "mesh")
+    browser.shows("photograph-facts", "photo.png: 240 x 180 px")
+    browser.begins("mesh-facts", "truck.ply: ")
 
     def is_examined():
         if browser.text("mesh-advice") == TOO_LONG:  # on a busy machine
@@ -362,9 +341,7 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     (folder / "other.png").write_bytes((folder / "photo.png").read_bytes())
     for name in ("other.png", "photo.png"):  # photo.png for the second time
         browser.upload("photograph", folder / name)
-        browser.wait(
-            lambda name=name: browser.text("photograph-facts").startswith(f"{name}: "), name
-        )
+        browser.begins("photograph-facts", f"{name}: ")
     assert browser.messages() == []
     browser.unfold("camera")
     browser.click("exif")
@@ -404,7 +381,7 @@ def test_each_of_several_photographs_keeps_its_box(browser, folder):
     scene.mesh.apply_scale(1000.0)  # the page still has the unit mm
     scene.mesh.export(folder / "table.ply")
     browser.drop(*map(folder.joinpath, [*scenes, "table.ply"]))
-    browser.wait(lambda: browser.text("mesh-facts").startswith("table.ply: "), "all")
+    browser.begins("mesh-facts", "table.ply: ")
     x0, y0, x1, y1 = scene.box.tolist()
     browser.drag((x0, y0), (x1, y1), 960)
     browser.wait(lambda: browser.box() == pytest.approx([x0, y0, x1, y1], abs=2), "its box")
@@ -436,18 +413,16 @@ def test_each_of_several_photographs_keeps_its_box(browser, folder):
 
 def test_an_answer_is_zoomed_to_and_the_pointer_shows_what_a_drag_does(browser, folder):
     """The object is 54 px of 240 wide; the key Z shows the whole photograph again."""
-    from selenium.webdriver import ActionChains
-
     browser.emulate(1280, 800)
     browser.drop(folder / "photo.png", folder / "truck.ply")
-    browser.wait(lambda: browser.text("mesh-facts").startswith("truck.ply: "), "mesh")
-    browser.wait(lambda: browser.text("photograph-facts").startswith("photo.png: "), "photograph")
+    browser.begins("mesh-facts", "truck.ply: ")
+    browser.begins("photograph-facts", "photo.png: ")
     canvas = browser.part("photograph")
     browser.wait(lambda: canvas.find_element("css selector", "img").size["width"] > 100, "shown")
     browser.drag((102, 70), (156, 147), 240)
     browser.wait(lambda: browser.box() is not None, "box")
     browser.click("register")
-    browser.wait(lambda: browser.text("progress") == "done", "result")
+    browser.shows("progress", "done")
     browser.wait(lambda: canvas.get_attribute("data-object"), "its extent")
 
     def extent():
@@ -464,19 +439,19 @@ def test_an_answer_is_zoomed_to_and_the_pointer_shows_what_a_drag_does(browser, 
     assert zoom_to_object() > 1.1, "the test needs a small object"
     browser.wait(is_zoomed, "the object")
     large = canvas.size["width"]
-    ActionChains(browser.driver).send_keys("z").perform()
+    browser.mouse().send_keys("z").perform()
     browser.wait(lambda: canvas.get_attribute("data-zoom") == "1", "the whole photograph")
     whole = canvas.size["width"]
     assert large == pytest.approx(zoom_to_object() * whole, rel=0.03)  # a scroll bar takes some
-    browser.driver.find_element("css selector", "[data-zoom=fit]").click()
+    browser.find("[data-zoom=fit]").click()
     browser.wait(lambda: canvas.size["width"] > 1.05 * whole, "the object again")
-    browser.driver.find_element("css selector", "[data-zoom=fit]").click()
+    browser.find("[data-zoom=fit]").click()
     browser.wait(lambda: canvas.size["width"] == whole, "the whole photograph")
 
     def aim(x, y):
         middle = canvas.size["width"] / 2, canvas.size["height"] / 2
         offset = round(2 * middle[0] * x - middle[0]), round(2 * middle[1] * y - middle[1])
-        ActionChains(browser.driver).move_to_element_with_offset(canvas, *offset).perform()
+        browser.mouse().move_to_element_with_offset(canvas, *offset).perform()
         return canvas.get_attribute("data-aim")
 
     x0, y0, x1, y1 = extent()
@@ -492,11 +467,11 @@ def test_an_answer_is_zoomed_to_and_the_pointer_shows_what_a_drag_does(browser, 
     browser.wait(
         lambda: browser.part("space").find_element("css selector", "canvas"), "the answer in 3D"
     )
-    browser.driver.find_element("css selector", "[data-zoom=fit]").click()
+    browser.find("[data-zoom=fit]").click()
     browser.wait(lambda: canvas.size["width"] > 1.05 * whole, "the object")
     (folder / "next.png").write_bytes((folder / "photo.png").read_bytes())
     browser.drop(folder / "next.png")
-    browser.wait(lambda: browser.text("photograph-facts").startswith("next.png: "), "the next one")
+    browser.begins("photograph-facts", "next.png: ")
     browser.wait(lambda: canvas.get_attribute("data-zoom") == "1", "it is shown whole")
     browser.click("no-photo")
     browser.wait(lambda: browser.text("verdict"), "the former one and its answer")
@@ -525,13 +500,11 @@ def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
         )
     (folder / "rig.csv").write_text("\n".join(lines))
     browser.drop(*map(folder.joinpath, ["table-4.png", "table-5.png", "table.ply", "rig.csv"]))
-    browser.wait(
-        lambda: browser.text("rig-facts") == "rig.csv: one pose in 2 photographs", "the rig"
-    )
-    browser.wait(lambda: browser.text("mesh-facts").startswith("table.ply: "), "the mesh")
+    browser.shows("rig-facts", "rig.csv: one pose in 2 photographs")
+    browser.begins("mesh-facts", "table.ply: ")
     assert browser.text("register") == "Find the pose in 2 photographs"
     browser.click("register")
-    browser.wait(lambda: browser.text("progress") == "done", "one pose")
+    browser.shows("progress", "done")
     for number, scene in enumerate(scenes, start=1):
         browser.click(f"photograph-{number}")
         box = pytest.approx(scene.box.tolist(), abs=4)
@@ -544,6 +517,4 @@ def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
     assert rotation_error(torch.tensor(document["rotation"]), torch.eye(3)) < 3
     browser.picture("viewer-rig")
     browser.click("no-rig")
-    browser.wait(
-        lambda: browser.text("register") == "Find the object and its pose", "as without a rig"
-    )
+    browser.shows("register", "Find the object and its pose")
