@@ -7,7 +7,7 @@ from torch.testing import assert_close
 import curvireg_torch as cr
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import CAMERA, scene, truck_bank
+from tests._support.scenes import CAMERA, bank_of, scene, truck_bank
 
 VIEWS = cr.sample_views(azimuth_step=45, elevations=[10, 40])
 MODULES = [cr.ApparentRidges, cr.AverageShadingGradient, cr.DepthCurvilinearSaliency, cr.EdgeBlur]
@@ -36,8 +36,8 @@ def test_layers_on_a_gpu(layer):
 
 @pytest.mark.cuda
 def test_bank_on_a_gpu():
-    bank = cr.ViewBank.build(example_mesh(), VIEWS, image_size=64, progress=False)
-    built = cr.ViewBank.build(example_mesh(), VIEWS, image_size=64, progress=False, device="cuda")
+    bank = bank_of(example_mesh(), VIEWS, image_size=64)
+    built = bank_of(example_mesh(), VIEWS, image_size=64, device="cuda")
     assert built.device.type == "cuda"
     # pixels on the outline may differ: a z-buffer there, rays here
     descriptors = built.descriptors.cpu().float()
@@ -63,7 +63,7 @@ def test_registrar_on_a_gpu(detected):
 def test_presets_on_a_gpu(preset):
     """Nearly equal views may change places: their scores are compared, and that a pose is found."""
     image, box, _ = scene(0)
-    bank = cr.ViewBank.build(truck_bank().mesh, pipeline=PRESETS[preset], progress=False)
+    bank = bank_of(truck_bank().mesh, pipeline=PRESETS[preset])
     registrar = cr.Registrar(bank, device="cuda")
     found = registrar([image.cuda()], box[None], CAMERA)[0]
     expected = cr.ViewMatcher(bank)(image[None], box[None]).scores

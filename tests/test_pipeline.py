@@ -117,7 +117,7 @@ def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_
     text = json.dumps({"box_jitter": 0.0, "terms": {"hog": {"weight": 2.0}}})
     path.write_text("\ufeff" + text, encoding="utf-8")  # as editors of Windows write it
     assert Pipeline.read(path) == Pipeline(box_jitter=0.0, terms=(Correlation(weight=2.0),))
-    with pytest.raises(MissingFileError, match="no such pipeline"):
+    with refused("no such pipeline", MissingFileError):
         Pipeline.read(tmp_path / "none.json")
     for text, message in (
         ("{", "not JSON"),

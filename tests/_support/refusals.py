@@ -5,6 +5,6 @@ import pytest
 from curvireg_torch.errors import InvalidInputError
 
 
-def refused(words):
+def refused(words, error=InvalidInputError):
     """Expect that the input is refused in these words."""
-    return pytest.raises(InvalidInputError, match=words)
+    return pytest.raises(error, match=words)

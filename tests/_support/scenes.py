@@ -26,16 +26,14 @@ CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
 @cache
 def truck_bank():
     views = sample_views(azimuth_step=15, elevations=[0, 15, 30, 45, 60])
-    return ViewBank.build(
-        example_mesh(), views, pipeline=PRESETS["classical"], image_size=96, progress=False
-    )
+    return bank_of(example_mesh(), views, pipeline=PRESETS["classical"], image_size=96)
 
 
 @cache
 def learned_registrar():
     """A registrar of the truck with the default pipeline, whose results have a confidence."""
     views = sample_views(azimuth_step=15, elevations=[0, 20, 40, 60])
-    return Registrar(ViewBank.build(example_mesh(), views, image_size=96, progress=False))
+    return Registrar(bank_of(example_mesh(), views, image_size=96))
 
 
 @cache
@@ -54,10 +52,24 @@ def seen_from(mesh, azimuth, elevation, radii):
     return transform(R, ahead - R @ mesh_centre(mesh))
 
 
+def bank_of(mesh, views=None, **options):
+    return ViewBank.build(mesh, views, progress=False, **options)
+
+
+def answer_of(registrar, image, box):
+    """The result of one photograph of ``CAMERA``."""
+    return registrar([image], box[None], CAMERA)[0]
+
+
+def degrees_off(result, T):
+    """How far the rotation of a result is from that of a pose."""
+    return rotation_error(result.rotation, T[:3, :3])
+
+
 def errors(result, T):
     """Degrees, and the error of the position as a fraction of the distance."""
     away = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
-    return float(rotation_error(result.rotation, T[:3, :3])), away
+    return float(degrees_off(result, T)), away
 
 
 @cache

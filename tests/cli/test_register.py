@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvireg_torch import Registrar, ViewBank, camera_matrix
+from curvireg_torch import Registrar, camera_matrix
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.register import _advice, _print_rivals, _write_pose, print_result
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
@@ -18,7 +18,7 @@ from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, box_of, check_pose
 from tests._support.numbers import double
 from tests._support.quick import slow_after
-from tests._support.scenes import scene, truck_bank
+from tests._support.scenes import bank_of, scene, truck_bank
 
 
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
@@ -116,9 +116,7 @@ def test_register_takes_views_from_the_bank_unless_a_pipeline_file_is_given(
     folder, register_one, document, capsys
 ):
     views = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
-    bank = ViewBank.build(
-        example_mesh(), pipeline=replace(PRESETS["fast"], views=views), progress=False
-    )
+    bank = bank_of(example_mesh(), pipeline=replace(PRESETS["fast"], views=views))
     bank.save(folder / "upright.safetensors")
     assert register_one("--preset", "fast", mesh="upright.safetensors") == 0
     assert document()["pipeline"]["views"]["azimuth_step"] == 120.0
@@ -176,7 +174,7 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
     mesh = example_mesh()
     mesh.units = "mm"
     views = {"views": truck_bank().views, "pipeline": PRESETS["classical"], "image_size": 96}
-    ViewBank.build(mesh, **views, progress=False).save(folder / "mm.safetensors")
+    bank_of(mesh, **views).save(folder / "mm.safetensors")
     bank = {"mesh": "mm.safetensors"}
     refused(
         register_one("--unit", "m", "--no-refine", **bank),
@@ -191,7 +189,7 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
     assert document()["unit"] == "mm"
     assert register_one("--no-refine", **bank) == 0
     mesh.units = None
-    ViewBank.build(mesh, **views, progress=False).save(folder / "mm.safetensors")
+    bank_of(mesh, **views).save(folder / "mm.safetensors")
     refused(
         register_one("--unit", "mm", "--no-refine", **bank), "mm.safetensors: built without a unit"
     )

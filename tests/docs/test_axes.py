@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 
 from curvireg_torch.visualization import pose_glb
 
@@ -74,7 +75,7 @@ UNITY_IMPORT = np.diag([-1.0, 1.0, 1.0])
 )
 def test_the_table_of_axes_is_that_of_the_file(posed, tool, imported):
     expected = posed[2] @ imported.T
-    np.testing.assert_allclose(in_camera(posed) @ table_row(tool).T, expected, atol=1e-5)
+    assert_allclose(in_camera(posed) @ table_row(tool).T, expected, atol=1e-5)
 
 
 def test_six_lines_for_each_way():
@@ -101,7 +102,7 @@ def test_the_lines_for_blender_move_a_mesh_to_its_pose(posed, tmp_path, monkeypa
     exec(blocks("py")[1], {"metres": METRES})
     moved = trimesh.transform_points(METRES * points, part.matrix_world)
     # the camera of the file is at its origin, and looks along -z as that of Blender does
-    np.testing.assert_allclose(moved, trimesh.transform_points(in_file, camera), atol=1e-5)
+    assert_allclose(moved, trimesh.transform_points(in_file, camera), atol=1e-5)
 
 
 def test_the_lines_for_unity_move_a_mesh_to_its_pose(posed):
@@ -118,5 +119,5 @@ def test_the_lines_for_unity_move_a_mesh_to_its_pose(posed):
     moved = imported_mesh @ turn.T + vectors["place"]
     # seen from the imported camera, which is turned around to look along its z
     around = np.diag([-1.0, 1.0, -1.0])
-    np.testing.assert_allclose(moved, in_file @ UNITY_IMPORT.T @ around.T, atol=1e-5)
+    assert_allclose(moved, in_file @ UNITY_IMPORT.T @ around.T, atol=1e-5)
     assert "forward, up)" in blocks("csharp")[0]

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
@@ -78,9 +79,7 @@ def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity():
         math.degrees(min(Rotation.from_matrix(e.T @ g @ s).magnitude() for s in group))
         for e, g in zip(est.numpy(), gt.numpy(), strict=True)
     ]
-    np.testing.assert_allclose(
-        metrics.symmetric_rotation_error(est, gt, symmetries), slow, atol=1e-6
-    )
+    assert_allclose(metrics.symmetric_rotation_error(est, gt, symmetries), slow, atol=1e-6)
     plain = metrics.symmetric_rotation_error(est, gt, torch.empty(0, 3, 3))
     assert_close(plain, rotation_error(est, gt))
     assert metrics.symmetric_rotation_error(est[:0], gt[:0], symmetries).shape == (0,)
@@ -103,8 +102,8 @@ def test_rotation_errors_of_missing_estimates_are_infinite(value, whole):
 def test_add_and_adds_against_loops():
     add = [np.linalg.norm(_move(e) - _move(g), axis=1).mean() for e, g in zip(EST, GT, strict=True)]
     adds = [cdist(_move(g), _move(e)).min(1).mean() for e, g in zip(EST, GT, strict=True)]
-    np.testing.assert_allclose(metrics.add_error(EST, GT, POINTS), add)
-    np.testing.assert_allclose(metrics.adds_error(EST, GT, POINTS), adds)
+    assert_allclose(metrics.add_error(EST, GT, POINTS), add)
+    assert_allclose(metrics.adds_error(EST, GT, POINTS), adds)
     # The model is asymmetric, so the opposite direction of nearest neighbours gives another result.
     points = torch.cat([POINTS * 0.01, double([[3.0, 0.0, 0.0]])])
     est = poses(1, 3)
@@ -131,10 +130,8 @@ def test_mssd_and_mspd_against_loops(monkeypatch):
     for chunk, few in ((metrics._CHUNK, 300), (90, 3)):
         monkeypatch.setattr(metrics, "_CHUNK", chunk)
         monkeypatch.setattr(metrics, "BOUNDING_POINTS", few)
-        np.testing.assert_allclose(metrics.mssd_error(EST, GT, POINTS, symmetries=symmetries), mssd)
-        np.testing.assert_allclose(
-            metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd
-        )
+        assert_allclose(metrics.mssd_error(EST, GT, POINTS, symmetries=symmetries), mssd)
+        assert_allclose(metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd)
 
 
 def test_mspd_error_is_infinite_for_points_behind_the_camera():

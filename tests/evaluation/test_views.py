@@ -3,9 +3,9 @@
 import json
 from collections import Counter
 
-import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from torch.testing import assert_close
 
 from curvireg_torch.data import BOPDataset
@@ -142,8 +142,8 @@ def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
     failures = Counter()
     for row in rows:
         assert len(row["photographs"]) == 3
-        np.testing.assert_allclose(row["photographs"][0]["rotation"], row["rotation"])
-        np.testing.assert_allclose(row["photographs"][0]["translation"], row["translation"])
+        assert_allclose(row["photographs"][0]["rotation"], row["rotation"])
+        assert_allclose(row["photographs"][0]["translation"], row["translation"])
         failures.update(view["failure"] is not None for view in row["photographs"])
     drawn = sum(
         view.photo == broken

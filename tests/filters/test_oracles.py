@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.ndimage import gaussian_filter
 from skimage.feature import hessian_matrix_eigvals
 from torch.testing import assert_close
@@ -60,7 +61,7 @@ def test_anisotropic_diffusion_against_loops(conductance):
         image, iterations=6, kappa=0.07, step=0.25, conductance=conductance
     )
     want = _perona_malik(image[0, 0].numpy(), 6, 0.07, 0.25, conductance)
-    np.testing.assert_allclose(got[0, 0], want, rtol=1e-12)
+    assert_allclose(got[0, 0], want, rtol=1e-12)
 
 
 def test_multiscale_curvilinear_saliency_against_loops():
@@ -78,7 +79,7 @@ def test_multiscale_curvilinear_saliency_against_loops():
     assert 0.05 < retained.mean() < 0.95
     # At the strongest pixel all levels are 1, and rounding decides which direction is selected.
     ties = np.isclose(np.sort(lengths, axis=0)[-1], np.sort(lengths, axis=0)[-2], rtol=1e-9)
-    np.testing.assert_allclose(np.where(ties, 0, got), np.where(ties, 0, want), atol=1e-10)
+    assert_allclose(np.where(ties, 0, got), np.where(ties, 0, want), atol=1e-10)
     assert ties.mean() < 0.1
 
 
@@ -112,7 +113,7 @@ def test_multiscale_focus_curves_against_loops(mode, saliency_weight, threshold)
     value = value * cs**saliency_weight
     want = value * np.stack([gx, gy]) / np.maximum(np.sqrt(cs), 1e-300)
     assert 0.02 < (value > 0).mean() < 0.98
-    np.testing.assert_allclose(got, want, atol=1e-9)
+    assert_allclose(got, want, atol=1e-9)
 
 
 def test_principal_curvature_image_against_scikit_image():
@@ -125,24 +126,24 @@ def test_principal_curvature_image_against_scikit_image():
             large, small = hessian_matrix_eigvals(np.stack([yy, xy, xx]))
             responses.append(sigma**2 * np.maximum(sign * (large if sign > 0 else small), 0))
         want = np.max(responses, axis=0)
-        np.testing.assert_allclose(np.hypot(*got.numpy()), want, atol=1e-12)
+        assert_allclose(np.hypot(*got.numpy()), want, atol=1e-12)
 
 
 def test_gaussian_gradient_saliency_and_second_derivatives_against_scipy_and_loops():
     image = photos(1, 33, dtype=torch.float64)
     x = filters.gaussian_smooth(image, 1.7)[0, 0].numpy()
     # scipy rounds the radius 4 sigma to the nearest pixel; gaussian_smooth rounds it up.
-    np.testing.assert_allclose(
+    assert_allclose(
         x, gaussian_filter(image[0, 0].numpy(), 1.7, mode="nearest", radius=7), rtol=1e-12
     )
     xx, yy, xy = (h[0, 0].numpy() for h in central_derivatives(smooth(image, 1.7))[2:])
     gx, gy = _gradient(image[0, 0].numpy(), 1.7)
-    np.testing.assert_allclose(filters.image_gradient(image, sigma=1.7)[0], [gx, gy], atol=1e-14)
+    assert_allclose(filters.image_gradient(image, sigma=1.7)[0], [gx, gy], atol=1e-14)
     saliency = filters.image_curvilinear_saliency(image, sigma=1.7)[0]
-    np.testing.assert_allclose(saliency, np.hypot(gx, gy) * [gx, gy], atol=1e-14)
-    np.testing.assert_allclose(xy[1:-1], np.gradient(gx, axis=0)[1:-1], atol=1e-14)
-    np.testing.assert_allclose(xx[:, 1:-1], np.diff(x, 2, axis=1), atol=1e-14)
-    np.testing.assert_allclose(yy[1:-1], np.diff(x, 2, axis=0), atol=1e-14)
+    assert_allclose(saliency, np.hypot(gx, gy) * [gx, gy], atol=1e-14)
+    assert_allclose(xy[1:-1], np.gradient(gx, axis=0)[1:-1], atol=1e-14)
+    assert_allclose(xx[:, 1:-1], np.diff(x, 2, axis=1), atol=1e-14)
+    assert_allclose(yy[1:-1], np.diff(x, 2, axis=0), atol=1e-14)
 
 
 def test_dominant_eigenvector_against_lapack():

@@ -26,6 +26,7 @@ from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background
 from tests._support.numbers import double, eye, seeded
 from tests._support.quick import slow_after
+from tests._support.scenes import degrees_off
 
 SIZE = (360, 480)
 K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
@@ -180,7 +181,7 @@ def test_keypoints_decide_where_most_of_the_object_is_hidden():
     ]
     around = registrar_of(azimuth_step=90, elevations=[0, 45])
     result = around([image], box[None], K)[0]
-    assert rotation_error(result.rotation, T[:3, :3]) < 5.0
+    assert degrees_off(result, T) < 5.0
     assert result.hypotheses[0].evidence["keypoints"] > max(
         h.evidence["keypoints"] for h in result.hypotheses[1:]
     )
@@ -201,7 +202,7 @@ def test_a_fit_that_leaves_the_keypoints_is_not_kept(monkeypatch):
     monkeypatch.setattr(block, "fit_poses", fit_elsewhere)
     monkeypatch.setattr(stages, "fit_texture_of", lambda *_: None)
     result = registrar()([photograph(T)], box_of(T)[None], K)[0]
-    assert rotation_error(result.rotation, T[:3, :3]) < 3.0
+    assert degrees_off(result, T) < 3.0
     assert result.edge_support > 0.0
     assert result.covariance is not None
 
@@ -254,7 +255,7 @@ def test_a_pose_outside_the_limits_is_no_start():
     limits = cr.PosePrior(rotation=other[:3, :3], within=40.0)
     around = registrar_of(azimuth_step=60, elevations=[25])
     result = around([photograph(T)], box_of(T)[None], K, prior=limits)[0]
-    assert min(float(rotation_error(h.rotation, T[:3, :3])) for h in result.hypotheses) > 40.0
+    assert min(float(degrees_off(h, T)) for h in result.hypotheses) > 40.0
 
 
 def test_meshes_without_colours_and_photographs_without_a_camera_have_no_keypoints():

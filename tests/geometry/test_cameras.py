@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
@@ -24,9 +25,9 @@ def test_project_points_agrees_with_opencv():
         torch.from_numpy(Rotation.from_rotvec(rotation).as_matrix()), torch.from_numpy(t)
     )
     ours = g.project_points(torch.from_numpy(X), T, K)
-    np.testing.assert_allclose(ours, expected, atol=1e-9)
+    assert_allclose(ours, expected, atol=1e-9)
     box = g.projected_boxes(torch.from_numpy(X), T, K)
-    np.testing.assert_allclose(box, [*expected.min(0), *expected.max(0)], atol=1e-9)
+    assert_allclose(box, [*expected.min(0), *expected.max(0)], atol=1e-9)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3])

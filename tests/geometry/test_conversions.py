@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
@@ -37,9 +38,9 @@ def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d():
         ours = g.project_points(
             torch.from_numpy(X), T, g.camera_matrix(f, f, px, py, dtype=torch.float64)
         )
-        np.testing.assert_allclose(ours, expected, atol=1e-8)
+        assert_allclose(ours, expected, atol=1e-8)
         back = [float(v) for v in g.viewpoint_from_rotation(R)]
-        np.testing.assert_allclose(back, (a, e, t), atol=1e-9)
+        assert_allclose(back, (a, e, t), atol=1e-9)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-4, 1.0, math.pi - 1e-4, math.pi - 1e-8, math.pi])
@@ -48,9 +49,9 @@ def test_axis_angle_agrees_with_scipy(angle):
     vectors = axes / np.linalg.norm(axes, axis=1, keepdims=True) * angle
     R = Rotation.from_rotvec(vectors).as_matrix()
     ours = g.rotation_from_axis_angle(torch.from_numpy(vectors))
-    np.testing.assert_allclose(ours, R, atol=1e-14)
+    assert_allclose(ours, R, atol=1e-14)
     back = g.axis_angle_from_rotation(torch.from_numpy(R))
-    np.testing.assert_allclose(g.rotation_from_axis_angle(back), R, atol=1e-14)
+    assert_allclose(g.rotation_from_axis_angle(back), R, atol=1e-14)
     assert back.norm(dim=1).max() <= math.pi + 1e-12
 
 
@@ -66,7 +67,7 @@ def test_symmetry_transforms_reads_matrices_and_axes_and_refuses_malformed_input
     transforms = g.symmetry_transforms({"symmetries_discrete": [HALF_TURN]})
     assert transforms.shape == (2, 4, 4)
     np.testing.assert_array_equal(transforms[1], np.reshape(HALF_TURN, (4, 4)))
-    np.testing.assert_allclose(transforms[1] @ double([4.0, 3.0, 7.0, 1.0]), [4.0, 3.0, 7.0, 1.0])
+    assert_allclose(transforms[1] @ double([4.0, 3.0, 7.0, 1.0]), [4.0, 3.0, 7.0, 1.0])
     for info, step, match in (
         ({"symmetries_discrete": [[1.0] * 12]}, 0.1, "expected 16"),
         ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}, 0.1, "length > 0"),
@@ -78,9 +79,9 @@ def test_symmetry_transforms_reads_matrices_and_axes_and_refuses_malformed_input
     assert len(transforms) == 32  # ceil(pi / 0.1)
     unit = np.array(AXIS) / 3.0
     for i, T in enumerate(transforms):
-        np.testing.assert_allclose(
+        assert_allclose(
             T[:3, :3], Rotation.from_rotvec(unit * i * 2 * np.pi / 32).as_matrix(), atol=1e-12
         )
         for along in (-5.0, 0.0, 2.0):
             point = np.array(OFFSET) + along * unit
-            np.testing.assert_allclose(T[:3, :3] @ point + T[:3, 3], point, atol=1e-12)
+            assert_allclose(T[:3, :3] @ point + T[:3, 3], point, atol=1e-12)

@@ -29,12 +29,12 @@ from curvireg_torch.inspection.photographs import (
 from curvireg_torch.inspection.report import Inspection
 from curvireg_torch.inspection.surface import look_symmetries
 from curvireg_torch.inspection.trial import Expected, Outcome, Trial, run_trial
-from curvireg_torch.matching import ViewBank
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.registration import Registrar
 from curvireg_torch.synthetic import example_mesh
 from tests._support.numbers import double, eye
 from tests._support.quick import slow_after
+from tests._support.scenes import bank_of
 
 
 def plate(size, at):
@@ -191,7 +191,7 @@ def test_symmetry_deviation_grows_with_the_asymmetry():
 @pytest.mark.slow
 def test_a_half_hollow_box_looks_alike_from_above_and_not_from_below():
     mesh = as_mesh(hollow_box())
-    bank = ViewBank.build(mesh, progress=False)
+    bank = bank_of(mesh)
     registrar = Registrar(bank, mesh_is="exact")
     assert registrar.symmetries_of(exact=True).shape[0] == 1
     pairs = look_alikes(bank, registrar.describer, None)
@@ -209,7 +209,7 @@ def test_look_alikes_leave_out_symmetries(monkeypatch):
     monkeypatch.setattr("curvireg_torch.inspection.look_alikes.LOOKED_AT", 12)
     box = as_mesh(trimesh.creation.box((1, 2, 3)))
     views = cr.sample_views(azimuth_step=60, elevations=[-45, 0, 45])
-    bank = ViewBank.build(box, views, image_size=64, progress=False)
+    bank = bank_of(box, views, image_size=64)
     registrar = Registrar(bank, mesh_is="exact")
     symmetries = registrar.symmetries_of(exact=True)
     counted = look_alikes(bank, registrar.describer, None)
@@ -416,7 +416,7 @@ def test_a_print_tells_sides_of_a_box_apart_and_a_plain_one_does_not():
     for name, colours in coloured.items():
         box.visual.face_colors = colours
         mesh = as_mesh(box)
-        bank = ViewBank.build(mesh, views, progress=False)
+        bank = bank_of(mesh, views)
         describer = Registrar(bank, mesh_is="exact").describer
         half_turn = torch.diag(double([-1.0, -1.0, 1.0]))
         view = cr.rotation_from_viewpoint(60.0, 20.0, 0.0).double()
@@ -433,7 +433,7 @@ def test_a_printed_can_is_predicted_better_with_its_texture_than_without():
     generate = PhotographGenerator(printed, 2, upright=True)
     right = {}
     for name, mesh in (("texture", printed), ("grey", replace(printed, colours=None))):
-        bank = ViewBank.build(mesh, views, progress=False)
+        bank = bank_of(mesh, views)
         registrar = Registrar(bank, mesh_is="exact", symmetries=torch.eye(4)[None].double())
         right[name] = run_trial(registrar, generate, 6, compare=False).expected.right
     assert right["texture"] > right["grey"] + 0.3

@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch.errors import InvalidInputError
@@ -60,8 +61,8 @@ def test_m3t_reads_the_pose_in_metres_and_the_mesh_in_its_unit(tmp_path):
     write_start("m3t", tmp_path, box(), DOCUMENT)
     detector = cv2.FileStorage(str(tmp_path / "object_detector.yaml"), cv2.FILE_STORAGE_READ)
     T = detector.getNode("link2world_pose").mat()
-    np.testing.assert_allclose(T[:3, :3], DOCUMENT["rotation"], atol=1e-9)
-    np.testing.assert_allclose(T[:3, 3], [0.03, -0.02, 0.9])
+    assert_allclose(T[:3, :3], DOCUMENT["rotation"], atol=1e-9)
+    assert_allclose(T[:3, 3], [0.03, -0.02, 0.9])
     assert T[3].tolist() == [0, 0, 0, 1]
     body = cv2.FileStorage(str(tmp_path / "object.yaml"), cv2.FILE_STORAGE_READ)
     assert body.getNode("geometry_unit_in_meter").real() == pytest.approx(0.001)
@@ -69,7 +70,7 @@ def test_m3t_reads_the_pose_in_metres_and_the_mesh_in_its_unit(tmp_path):
     assert body.getNode("geometry_enable_culling").real() == 1
     np.testing.assert_array_equal(body.getNode("geometry2body_pose").mat(), np.eye(4))
     mesh = load_mesh(tmp_path / body.getNode("geometry_path").string(), unit="mm")
-    np.testing.assert_allclose(mesh.bounds, box().bounds)
+    assert_allclose(mesh.bounds, box().bounds)
     assert mesh.surface.volume == pytest.approx(box().volume)
 
 
@@ -84,8 +85,8 @@ def test_m3t_shows_both_sides_of_an_open_surface(tmp_path):
 def test_visp_reads_polygons_counter_clockwise_from_outside(tmp_path):
     write_start("visp", tmp_path, box(), DOCUMENT)
     vertices, polygons = read_cao(tmp_path / "object.cao")
-    np.testing.assert_allclose(vertices.min(axis=0), [-0.05, -0.035, -0.02])
-    np.testing.assert_allclose(vertices.max(axis=0), [0.07, 0.045, 0.02])
+    assert_allclose(vertices.min(axis=0), [-0.05, -0.035, -0.02])
+    assert_allclose(vertices.max(axis=0), [0.07, 0.045, 0.02])
     assert [len(polygon) for polygon in polygons] == [4] * 6
     for polygon in polygons:
         a, b, c, _ = vertices[polygon]
@@ -104,13 +105,13 @@ def test_visp_finds_the_pose_from_points_and_reads_it(tmp_path):
     assert count == 8, "the corners of the box"
     found, angle, translation = cv2.solvePnP(model, pixels, np.array(K), None)
     assert found
-    np.testing.assert_allclose(angle[:, 0], ANGLE, atol=1e-4)
-    np.testing.assert_allclose(translation[:, 0], [0.03, -0.02, 0.9], atol=1e-4)
+    assert_allclose(angle[:, 0], ANGLE, atol=1e-4)
+    assert_allclose(translation[:, 0], [0.03, -0.02, 0.9], atol=1e-4)
     quaternion = np.array(DOCUMENT["quaternion"])
     for same in (quaternion, -quaternion):
         write_start("visp", tmp_path, box(), {**DOCUMENT, "quaternion": same.tolist()})
         pose = [float(x) for x in (tmp_path / "object.pos").read_text().split()]
-        np.testing.assert_allclose(pose, [0.03, -0.02, 0.9, *ANGLE], atol=1e-9)
+        assert_allclose(pose, [0.03, -0.02, 0.9, *ANGLE], atol=1e-9)
     write_start("visp", tmp_path, box(), {**DOCUMENT, "quaternion": [-1.0, 0.0, 0.0, 0.0]})
     assert [float(x) for x in (tmp_path / "object.pos").read_text().split()[3:]] == [0.0] * 3
 
@@ -120,7 +121,7 @@ def test_visp_gets_few_faces_and_points_of_a_large_mesh(tmp_path):
     write_start("visp", tmp_path, mesh, DOCUMENT)
     vertices, polygons = read_cao(tmp_path / "object.cao")
     assert 500 < len(polygons) <= 2000
-    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, rtol=0.02)
+    assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, rtol=0.02)
     assert int(next(numbers(tmp_path / "object.init"))) == POINTS
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 
 import curvireg_torch as cr
 from curvireg_torch.mesh import Mesh, mesh_centre, mesh_radius, mesh_symmetries
@@ -46,7 +47,7 @@ def test_left_over_parts_do_not_set_the_box(scale, at):
     whole.apply_scale(scale)
     mesh = as_mesh(whole)
     assert len(mesh.faces) == 12
-    np.testing.assert_allclose(mesh.extents, np.array(SIDES) * scale)
+    assert_allclose(mesh.extents, np.array(SIDES) * scale)
     assert mesh_radius(mesh) == pytest.approx(0.5 * float(np.linalg.norm(SIDES)) * scale)
     assert mesh_centre(mesh).abs().max() < 1e-9 * scale
     (warning,) = mesh.warnings
@@ -125,9 +126,7 @@ def test_coordinates_of_maps(tmp_path, load, suffix):
     mesh, texts = load(tmp_path / f"a.{suffix}", unit="mm")
     if suffix == "obj":
         assert not texts
-        np.testing.assert_allclose(
-            mesh.vertices[mesh.faces] - offset, sphere.triangles - offset, atol=1e-6
-        )
+        assert_allclose(mesh.vertices[mesh.faces] - offset, sphere.triangles - offset, atol=1e-6)
     else:
         assert "rounded to steps of 0.5" in texts[0]
         assert [warning.kind for warning in mesh.warnings] == ["precision"]

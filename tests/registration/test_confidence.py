@@ -18,7 +18,7 @@ from curvireg_torch.synthetic import procedural_background
 from tests._support.numbers import double, seeded
 from tests._support.quick import slow_after
 from tests._support.results import FEATURES
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
+from tests._support.scenes import CAMERA, SIZE, answer_of, learned_registrar, scene, truck_registrar
 
 R30 = sample_views(azimuth_step=12, elevations=[0]).rotations
 
@@ -175,7 +175,7 @@ def test_only_the_default_pipeline_is_calibrated():
 
 def test_uncalibrated_pipeline_gives_no_number():
     image, box, _ = scene(0)
-    result = truck_registrar()([image], box[None], CAMERA)[0]
+    result = answer_of(truck_registrar(), image, box)
     assert result.confidence is result.no_match_probability is result.ambiguous is None
     assert result.probabilities == ()
     assert not result.reliable
@@ -236,7 +236,7 @@ def test_confidence_does_not_depend_on_the_number_of_reported_hypotheses(seed):
     image, box, _ = scene(seed)
     bank = learned_registrar().bank
     registrars = (Registrar(bank, pipeline=replace(bank.pipeline, hypotheses=n)) for n in (1, 2))
-    one, two = (registrar([image], box[None], CAMERA)[0] for registrar in registrars)
+    one, two = (answer_of(registrar, image, box) for registrar in registrars)
     assert (len(one.hypotheses), len(two.hypotheses)) == (1, 2)
     assert torch.equal(one.rotation, two.rotation)
     assert (one.confidence_features, one.confidence) == (two.confidence_features, two.confidence)

@@ -9,14 +9,21 @@ import torch
 from curvireg_torch import camera_matrix
 from curvireg_torch.fitting import focal_length
 from curvireg_torch.fitting.edges import EdgeCrops
-from curvireg_torch.geometry import Camera, axis_angle_from_rotation, rotation_error
+from curvireg_torch.geometry import Camera, axis_angle_from_rotation
 from curvireg_torch.geometry.cameras import point_in_cameras, rotation_towards
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.hypotheses import Hypotheses, projected_box
 from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.numbers import double, seeded
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
+from tests._support.scenes import (
+    CAMERA,
+    SIZE,
+    degrees_off,
+    learned_registrar,
+    scene,
+    truck_registrar,
+)
 from tests.fitting.test_focal_length import NEAR, near_scene
 
 
@@ -46,7 +53,7 @@ def test_an_unknown_camera_is_estimated():
     assert torch.equal(result.camera.matrix, result.projection[1])
     ratio = float(result.camera.matrix[0, 0] / NEAR[0, 0])
     assert abs(ratio - 1.0) < max(0.1, 3.0 * result.camera.focal_deviation)
-    assert rotation_error(result.rotation, T[:3, :3]) < 5.0
+    assert degrees_off(result, T) < 5.0
     position = result.transform[:3, 3] / ratio - T[:3, 3]
     assert position.norm() < 0.1 * float(T[:3, 3].norm()), (
         "the distance is proportional to the focal length"
@@ -74,7 +81,7 @@ def test_focal_lengths_with_small_deviations_are_right():
         T[:3, 3] = near - T[:3, :3] @ describer.centre
         image, box = synthesize_photograph(mesh, T, K, size, generator)
         result = learned_registrar()([image], box[None])[0]
-        assert rotation_error(result.rotation, T[:3, :3]) < 3.0
+        assert degrees_off(result, T) < 3.0
         error = abs(float((result.camera.matrix[0, 0] / K[0, 0]).log()))
         ratios.append(error / result.camera.focal_deviation)
         if result.camera.focal_deviation < 0.05:

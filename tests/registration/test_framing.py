@@ -21,7 +21,7 @@ from curvireg_torch.registration.judging import outside_warnings
 from curvireg_torch.registration.photograph import as_photograph
 from tests._support.numbers import double, eye
 from tests._support.quick import slow_after
-from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene
+from tests._support.scenes import CAMERA, SIZE, answer_of, errors, learned_registrar, scene
 
 SQUARE = torch.from_numpy(trimesh.creation.box((1.0, 1.0, 0.001)).vertices.copy())
 K = camera_matrix(100.0, 100.0, 49.5, 39.5, dtype=torch.float64)
@@ -77,13 +77,13 @@ def test_a_cut_object_has_a_warning_and_is_not_reliable():
     image, box, _ = scene(0)
     cut = int(box[0] + 0.6 * (box[2] - box[0]))
     part = image[:, :, :cut].contiguous()
-    result = learned_registrar()([part], box[None], CAMERA)[0]
+    result = answer_of(learned_registrar(), part, box)
     features = result.confidence_features
     assert features["border"] == 1
     assert not result.reliable
     if features["outside"] >= 0.1:
         assert any("outside the photograph" in text for text in result.warnings)
-    whole = learned_registrar()([image], box[None], CAMERA)[0].confidence_features
+    whole = answer_of(learned_registrar(), image, box).confidence_features
     assert (whole["border"], whole["outside"]) == (0, pytest.approx(0.0, abs=0.02))
     assert np.prod(SIZE) > part[0].numel()
 

@@ -17,7 +17,7 @@ from curvireg_torch.visualization.overlay import contour_overlay, registration_s
 from tests._support.canisters import canister
 from tests._support.numbers import double
 from tests._support.results import FEATURES, registration
-from tests._support.scenes import CAMERA
+from tests._support.scenes import answer_of
 from tests.registration.test_ties import hollow_box, photograph, registrar_of
 
 UPRIGHT = RoundAxis(double([0.0, 0.0, 1.0]), torch.zeros(3).double(), False)
@@ -40,7 +40,7 @@ def of_canister():
     views = sample_views(azimuth_step=15, elevations=[-50, -25, 0, 25, 50])
     registrar = Registrar(ViewBank.build(canister(), views, image_size=96, progress=False))
     image, box, T = photograph(canister(), 160.0, 40.0, 1)
-    return registrar, registrar([image], box[None], CAMERA)[0], (image, box, T)
+    return registrar, answer_of(registrar, image, box), (image, box, T)
 
 
 def test_the_axis_of_a_canister_is_certain_where_its_turn_is_not():
@@ -68,7 +68,7 @@ def test_the_axis_is_drawn_where_it_alone_is_certain():
 def test_a_pair_has_a_probability_of_its_own():
     registrar = registrar_of(hollow_box())
     image, box, _ = photograph(hollow_box(), 35.0, 25.0, 0)
-    result = registrar([image], box[None], CAMERA)[0]
+    result = answer_of(registrar, image, box)
     assert result.ambiguous == "half turn"
     assert result.axis is None
     assert result.confidence < 0.6

@@ -9,7 +9,7 @@ from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
 from curvireg_torch.registration import judging
 from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support.poses import poses as random_poses
-from tests._support.scenes import CAMERA, learned_registrar, scene
+from tests._support.scenes import CAMERA, answer_of, learned_registrar, scene
 
 
 def chiral_mesh():
@@ -58,7 +58,7 @@ def test_confidence_falls_where_the_mirror_image_fits_better(monkeypatch):
     known = learned_registrar()
     for gain, is_doubted in ((-1.0, False), (0.4, False), (1.5, True)):
         monkeypatch.setattr(judging, "mirror_gain", lambda *_, gain=gain: torch.tensor([gain]))
-        result = known([image], box[None], CAMERA)[0]
+        result = answer_of(known, image, box)
         assert (judging.MIRROR_WARNING in result.warnings) == is_doubted
         assert result.reliable != is_doubted
         if is_doubted:
@@ -77,7 +77,7 @@ def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
     monkeypatch.setattr(judging, "mirror_gain", recorded)
     image, box, _ = scene(0)
     own = learned_registrar()
-    assert own([image], box[None], CAMERA)[0].reliable
+    assert answer_of(own, image, box).reliable
     views = sample_views(azimuth_step=15, elevations=[0, 20, 40, 60])
     mesh = mirrored(own.bank.mesh)
     bank = ViewBank.build(mesh, views, image_size=96, progress=False)

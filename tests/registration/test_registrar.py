@@ -31,6 +31,9 @@ from tests._support.numbers import double, seeded
 from tests._support.scenes import (
     CAMERA,
     SIZE,
+    answer_of,
+    bank_of,
+    degrees_off,
     errors,
     learned_registrar,
     scene,
@@ -66,7 +69,7 @@ def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
     views = sample_views(azimuth_step=30, elevations=[0, 20, 40])
     result = Registrar(meshes, views=views)([IMAGE], BOX[None], CAMERA)[0]
     assert result.mesh_index == 1
-    assert rotation_error(result.rotation, TRUTH[:3, :3]) < 5
+    assert degrees_off(result, TRUTH) < 5
     with pytest.raises(InvalidInputError, match="empty list"):
         Registrar([])
     with pytest.raises(InvalidInputError, match="knows one mesh"):
@@ -77,9 +80,7 @@ def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
 
 def test_flat_mesh_without_colours_warns():
     plate = trimesh.creation.box((1.0, 0.6, 1e-5))
-    bank = ViewBank.build(
-        plate, sample_views(azimuth_step=90, elevations=[20]), image_size=64, progress=False
-    )
+    bank = bank_of(plate, sample_views(azimuth_step=90, elevations=[20]), image_size=64)
     assert "front and back look alike" in Registrar(bank).mesh_warnings[0]
     assert truck_registrar().mesh_warnings == ()
 
@@ -140,7 +141,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
     )
     monkeypatch.setattr(type(registrar.matcher), "rank", lambda *_: lowered)
     (result,) = stages.register(registrar, [item], query)
-    assert (float(rotation_error(result.rotation, TRUTH[:3, :3])) < 4) == right
+    assert (float(degrees_off(result, TRUTH)) < 4) == right
     assert len(result.hypotheses) == registrar.pipeline.hypotheses
 
 
@@ -164,10 +165,8 @@ def test_origin_of_the_mesh_may_be_far_away():
     away = double([1e6 * float(mesh_radius(example_mesh())), 0.0, 0.0])
     mesh.apply_translation(away.numpy())
     views = sample_views(azimuth_step=15, elevations=[0, 20, 40])
-    result = Registrar(ViewBank.build(mesh, views, image_size=96, progress=False))(
-        [IMAGE], BOX[None], CAMERA
-    )[0]
-    assert rotation_error(result.rotation, TRUTH[:3, :3]) < 2.0
+    result = Registrar(bank_of(mesh, views, image_size=96))([IMAGE], BOX[None], CAMERA)[0]
+    assert degrees_off(result, TRUTH) < 2.0
     position = result.rotation @ away + result.translation
     assert ((position - TRUTH[:3, 3]).norm() / TRUTH[:3, 3].norm()) < 0.02
 
@@ -213,7 +212,7 @@ def test_covariance_needs_a_reliable_result_and_a_camera(limit):
     bank = learned_registrar().bank
     pipeline = replace(bank.pipeline, fit=FitSettings(reliable=limit))
     registrar = Registrar(bank, pipeline=pipeline)
-    result = registrar([IMAGE], BOX[None], CAMERA)[0]
+    result = answer_of(registrar, IMAGE, BOX)
     assert result.reliable == (limit == 0.0)
     for value in (result.covariance, result.standard_deviations):
         assert (value is not None) == result.reliable
@@ -258,10 +257,10 @@ WRONG = BOX + torch.tensor([-0.1, 0.2, 0.1, 0.15]) * (BOX[2:] - BOX[:2]).repeat(
 
 def test_wrong_box_is_corrected():
     registrar = truck_registrar()
-    result = registrar([IMAGE], WRONG[None], CAMERA)[0]
+    result = answer_of(registrar, IMAGE, WRONG)
     before = truck_registrar(box_jitter=0.0)([IMAGE], WRONG[None], CAMERA)[0]
     assert before.corrected_box is None
-    assert rotation_error(result.rotation, TRUTH[:3, :3]) < 2
+    assert degrees_off(result, TRUTH) < 2
     assert result.score > before.score
     overlap = box_iou(torch.stack([result.corrected_box, WRONG.double()]), BOX[None].double())[:, 0]
     assert overlap[0] > overlap[1] + 0.1
@@ -286,7 +285,7 @@ def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evide
     )
     answers = iter([first, other])
     monkeypatch.setattr(stages, "register_boxes", lambda *_: [next(answers)])
-    result = registrar([IMAGE], WRONG[None], CAMERA)[0]
+    result = answer_of(registrar, IMAGE, WRONG)
     assert (result.hypotheses is first.hypotheses) != better
     assert (result.corrected_box is None) != better
 
@@ -305,9 +304,7 @@ def test_hypotheses_that_merge_are_put_back_and_come_last():
         images.append(image)
         boxes.append(box)
     views = sample_views(azimuth_step=30, elevations=[20])
-    registrar = Registrar(
-        ViewBank.build(mesh, views, pipeline=PRESETS["classical"], image_size=96, progress=False)
-    )
+    registrar = Registrar(bank_of(mesh, views, pipeline=PRESETS["classical"], image_size=96))
     restored = 0
     for result in registrar(images, torch.stack(boxes), CAMERA):
         starts = (registrar.bank.rotations[h.view].double() for h in result.hypotheses)
@@ -365,7 +362,7 @@ def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
     """Photographs of a rig, registered to two meshes; if both are absent, the error is that of the
     first."""
     both = Registrar([truck_bank(), truck_bank()])
-    found = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
+    found = answer_of(truck_registrar(), IMAGE, BOX)
     absent = {both}
     prepared = Mock(wraps=photograph_module.as_photograph)
     monkeypatch.setattr(photograph_module, "as_photograph", prepared)
@@ -387,9 +384,9 @@ def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
 
 def test_a_registrar_that_was_used_can_be_pickled_and_copied():
     registrar = truck_registrar()
-    expected = registrar([IMAGE], BOX[None], CAMERA)[0]
+    expected = answer_of(registrar, IMAGE, BOX)
     content = pickle.dumps(registrar)
     for other in (pickle.loads(content), copy(registrar)):
-        found = other([IMAGE], BOX[None], CAMERA)[0]
+        found = answer_of(other, IMAGE, BOX)
         assert torch.equal(found.rotation, expected.rotation)
     assert copy(registrar).describer is registrar.describer

@@ -26,7 +26,7 @@ from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.registration import block, hypotheses, stages
 from curvireg_torch.terms import Appearance
 from tests._support.numbers import double, eye
-from tests._support.scenes import CAMERA, scene, truck_bank
+from tests._support.scenes import CAMERA, bank_of, scene, truck_bank
 
 
 def test_coherent_views_are_connected_with_the_best_by_neighbours():
@@ -116,7 +116,7 @@ def searched(*truth, camera="perspective", frame="own", kind=Peak, least_coheren
     turn = principal_rotation(mesh) if frame == "principal" else eye(3)
     grid = sample_views(azimuth_step=20, elevations=[0, 50], distances=[3.0, 4.5])
     views = grid.in_frame(turn)
-    bank = ViewBank.build(mesh, views, pipeline=pipeline, progress=False)
+    bank = bank_of(mesh, views, pipeline=pipeline)
     azimuth, elevation, distance = truth
     R = rotation_from_viewpoint(azimuth, elevation).double() @ turn
     matcher = kind(bank, R, distance)
@@ -268,7 +268,7 @@ def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh
     T[:3, :3] = turn
     one, _ = paper_bank()
     copy = replace(one.mesh, surface=one.mesh.surface.copy().apply_transform(T.numpy()))
-    other = ViewBank.build(copy, pipeline=PRESETS["paper"], progress=False)
+    other = bank_of(copy, pipeline=PRESETS["paper"])
     assert_close(other.rotations.double() @ turn, one.rotations.double(), rtol=0, atol=1e-5)
     in_frame = one.rotations.double() @ principal_rotation(one.mesh).T
     assert_close(in_frame, paper_views().rotations.double(), rtol=0, atol=1e-5)

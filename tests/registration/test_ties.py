@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch import Registrar, sample_views
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.mesh.symmetry import FEATURE_FRACTION, feature_fractions
@@ -16,7 +16,7 @@ from curvireg_torch.registration.target import MAX_SIBLINGS, spread, telling_sym
 from curvireg_torch.synthetic import synthesize_photograph
 from tests._support.numbers import eye, seeded
 from tests._support.quick import slow_after
-from tests._support.scenes import CAMERA, SIZE, seen_from
+from tests._support.scenes import CAMERA, SIZE, bank_of, seen_from
 
 
 @cache
@@ -47,7 +47,7 @@ def marked_box():
 @cache
 def registrar_of(mesh, **options):
     views = sample_views(azimuth_step=15, elevations=[10, 30, 50])
-    return Registrar(ViewBank.build(mesh, views, image_size=96, progress=False), **options)
+    return Registrar(bank_of(mesh, views, image_size=96), **options)
 
 
 def photograph(mesh, azimuth, elevation, seed):
@@ -115,7 +115,7 @@ def test_poses_that_only_a_hidden_feature_tells_apart_are_named(side, notable):
     cube.apply_translation((75, 0, 47))
     mesh = trimesh.util.concatenate([box, cube])
     views = sample_views(azimuth_step=15, elevations=[-50, -35])
-    registrar = Registrar(ViewBank.build(mesh, views, image_size=96, progress=False))
+    registrar = Registrar(bank_of(mesh, views, image_size=96))
     assert registrar.telling_symmetries.notable == notable
     result, _ = registered(registrar, 30.0, -40.0, 3)
     assert result.feature_is_hidden

@@ -18,7 +18,7 @@ from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.registration.rig import RigPhotograph
 from curvireg_torch.registration.stages import _other_box, describe, rank
 from tests._support.numbers import double, eye
-from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene
+from tests._support.scenes import CAMERA, SIZE, answer_of, errors, learned_registrar, scene
 
 
 def visible_registrar(**changes):
@@ -77,12 +77,12 @@ def test_what_lies_beside_a_visible_box_does_not_count():
 @pytest.mark.parametrize("seed", [0, 8])
 def test_a_hidden_half_needs_a_box_that_is_said_to_be_visible(seed):
     image, box, T = half_hidden(seed)
-    result = visible_registrar()([image], box[None], CAMERA)[0]
+    result = answer_of(visible_registrar(), image, box)
     assert errors(result, T)[0] < 10.0
     item = as_photograph(image, box, CAMERA)
     assert _other_box(visible_registrar(), item, result) is None
     assert _other_box(learned_registrar(), item, result) is not None
-    as_whole = learned_registrar()([image], box[None], CAMERA)[0]
+    as_whole = answer_of(learned_registrar(), image, box)
     assert errors(as_whole, T)[0] > 15.0
     assert not as_whole.reliable
 
@@ -95,5 +95,5 @@ def test_similar_meshes_and_views_of_the_bank_are_compared_as_before():
         for box_is in ("whole", "visible"):
             pipeline = replace(bank.pipeline.with_boxes(box_is), **changes)
             registrar = cr.Registrar(bank, pipeline=pipeline, mesh_is=mesh_is)
-            found.append(registrar([image], box[None], CAMERA)[0].rotation)
+            found.append(answer_of(registrar, image, box).rotation)
         assert found[0].equal(found[1])

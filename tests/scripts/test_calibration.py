@@ -5,6 +5,7 @@ from argparse import Namespace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 
 pytest.importorskip("sklearn")
 
@@ -88,17 +89,15 @@ def test_mirrored_shapes_are_no_rotation_of_the_shape():
     tied = Tied(options(cad="mirrored"))
     one = tied.mesh(2)
     other = tied.mesh(2 + TWIN)
-    np.testing.assert_allclose(other.triangles[:, ::-1] * (-1.0, 1.0, 1.0), one.triangles)
+    assert_allclose(other.triangles[:, ::-1] * (-1.0, 1.0, 1.0), one.triangles)
 
 
 def test_symmetries_of_shapes_keep_their_materials():
     shapes = Shapes(options())
     for obj_id in (1, 2):
         S = shapes.symmetries(obj_id)
-        np.testing.assert_allclose(S[0], np.eye(3))
-        np.testing.assert_allclose(
-            S @ S.transpose(0, 2, 1), np.broadcast_to(np.eye(3), S.shape), atol=1e-9
-        )
+        assert_allclose(S[0], np.eye(3))
+        assert_allclose(S @ S.transpose(0, 2, 1), np.broadcast_to(np.eye(3), S.shape), atol=1e-9)
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.35, 0.6])

@@ -13,7 +13,7 @@ from curvireg_torch.features.backbone import Backbone, describe, similarity
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.terms import Appearance
-from tests._support.scenes import scene
+from tests._support.scenes import bank_of, scene
 
 VIEWS = sample_views(azimuth_step=30, elevations=[0, 30])  # those of `small_bank`
 PIPELINE = Pipeline(field="focus", box_jitter=0.0, bank=replace(Pipeline().bank, image_size=64))
@@ -51,7 +51,7 @@ def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
 
 
 def test_large_bank_compares_the_cells_of_the_best_views(small_bank, truck, matcher):
-    large_bank = ViewBank.build(truck, VIEWS, pipeline=large(), progress=False)
+    large_bank = bank_of(truck, VIEWS, pipeline=large())
     before = ViewMatcher(small_bank, pipeline=replace(PIPELINE, terms=PIPELINE.terms[:3]))(
         *photograph(2)
     )
@@ -86,7 +86,7 @@ def painted_bank():
     colours[box.triangles_center[:, 1] < -0.29] = [220, 30, 30, 255]
     colours[box.triangles_center[:, 1] > 0.29] = [30, 30, 220, 255]
     box.visual.face_colors = colours
-    return ViewBank.build(as_mesh(box), VIEWS, pipeline=PIPELINE, progress=False)
+    return bank_of(as_mesh(box), VIEWS, pipeline=PIPELINE)
 
 
 @pytest.mark.parametrize("exhaustive_limit", [1000, 0])

@@ -117,7 +117,7 @@ def test_check_photograph_and_check_pixels_refuse_other_images():
         (1.01, "255"),
         (-0.01, "255"),
     ):
-        with pytest.raises(ImageError, match=match):
+        with refused(match, ImageError):
             checks.check_pixels(torch.full((3, 2, 2), value), "of the box")
 
 

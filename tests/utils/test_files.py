@@ -43,8 +43,8 @@ def test_write_file_keeps_the_old_content_if_writing_fails(path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
-        with pytest.raises(
-            OutputError, match=r"file: cannot be written \(File too large\); choose another place"
+        with refused(
+            r"file: cannot be written \(File too large\); choose another place", OutputError
         ):
             files.write_file(path, NEW)
     finally:
@@ -57,7 +57,7 @@ def test_write_file_refuses_other_targets(tmp_path, name):
     (tmp_path / "file").write_bytes(OLD)
     (tmp_path / "folder").mkdir()
     (tmp_path / "null").symlink_to(os.devnull)
-    with pytest.raises(CurviregError, match=f"{name}: cannot be written") as error:
+    with refused(f"{name}: cannot be written", CurviregError) as error:
         files.write_file(tmp_path / name, NEW)
     assert isinstance(error.value, OSError)
     assert len(str(error.value).splitlines()) == 1
@@ -70,7 +70,7 @@ def test_check_writable_leaves_nothing_and_names_the_folder(tmp_path):
     assert not list((tmp_path / "a" / "b").iterdir())
     (tmp_path / "file").write_bytes(OLD)
     reason = r"file: cannot be written to \(.*\); choose another folder$"
-    with pytest.raises(OutputError, match=reason) as caught:
+    with refused(reason, OutputError) as caught:
         files.check_writable(tmp_path / "file")
     assert caught.value.kind == "out"
 
@@ -128,7 +128,7 @@ def test_read_json_refuses_malicious_missing_and_large_files(tmp_path):
         file.truncate((1 << 25) + 1)  # a sparse file
     with refused("larger than 33,554,432 bytes"):
         files.read_json(tmp_path / "a.json", dict, "README")
-    with pytest.raises(MissingFileError, match="no such file; README"):
+    with refused("no such file; README", MissingFileError):
         files.read_json(tmp_path / "none.json", dict, "README")
 
 
@@ -203,7 +203,7 @@ def test_a_csv_file_that_grows_has_each_row_at_once_and_begins_anew(tmp_path):
     assert path.read_bytes() == b'name,value\n"\'=a,b",1.5\n'
     grown.add(["c", ""])
     assert path.read_text().splitlines()[1:] == ['"\'=a,b",1.5', "c,"]
-    with pytest.raises(OutputError, match=r"none.x\.csv: cannot be written"):
+    with refused(r"none.x\.csv: cannot be written", OutputError):
         files.CsvFile(tmp_path / "none" / "x.csv", ["name"]).add(["a"])
 
 

@@ -374,7 +374,7 @@ def test_register_is_cancelled_by_the_user():
     session = new_session("photo.png", "truck.ply", "--pipeline", "small.json", "--box", *box)
     session.load()
     session.cancelled = True
-    with pytest.raises(CurviregError, match=r"^stopped$"):
+    with refused(r"^stopped$", CurviregError):
         session.register()
     assert (session.shot.result, session.cancelled) == (None, False)
     assert session.progress[0] == "bank", "at the first step"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.testing import assert_allclose
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import project_points, rotation_from_axis_angle
@@ -49,7 +50,7 @@ def test_pose_glb_camera_projects_mesh_and_photograph(unit, metres):
     expected = project_points(
         torch.from_numpy(np.array(mesh.triangles.reshape(-1, 3))), T, CAMERA
     ).numpy()
-    np.testing.assert_allclose(project(points, tree), expected, atol=1e-2)
+    assert_allclose(project(points, tree), expected, atol=1e-2)
     extras = next(node for node in tree["nodes"] if "camera" in node)["extras"]
     assert (extras["T_cam_from_model"], extras["camera_matrix"]) == (T.tolist(), CAMERA.tolist())
     depth = float((T[:3, 3])[2])
@@ -59,14 +60,14 @@ def test_pose_glb_camera_projects_mesh_and_photograph(unit, metres):
     corners = trimesh.transform_points(back.geometry[plane].vertices, parts[plane])
     H, W = SIZE
     expected = np.array([(-0.5, -0.5), (W - 0.5, -0.5), (W - 0.5, H - 0.5), (-0.5, H - 0.5)])
-    np.testing.assert_allclose(project(corners, tree), expected, atol=1e-2)
+    assert_allclose(project(corners, tree), expected, atol=1e-2)
     assert corners[:, 2].max() < points[:, 2].min()
     # It faces the camera, and its top is the picture's top.
     assert back.geometry[plane].face_normals[0] @ parts[plane][:3, :3].T @ [0, 0, 1] > 0
     texture = back.geometry[plane].visual.material.baseColorTexture
     shown = np.asarray(texture.convert("RGB"), float) / 255
     assert np.abs(shown - image.permute(1, 2, 0).numpy()).mean() < 0.03
-    np.testing.assert_allclose(back.geometry[plane].visual.uv[0], [0, 1], atol=1e-6)
+    assert_allclose(back.geometry[plane].visual.uv[0], [0, 1], atol=1e-6)
 
 
 def test_pose_glb_keeps_vertex_colours():
@@ -128,7 +129,7 @@ def test_scene_glb_places_each_camera_where_its_photograph_was_taken():
     for node, pose in zip(nodes, poses, strict=True):
         world_from_camera = np.array(node["matrix"]).reshape(4, 4).T  # glTF writes columns
         seen = trimesh.transform_points(world, np.linalg.inv(world_from_camera))
-        np.testing.assert_allclose(
+        assert_allclose(
             project(seen, tree), project_points(corners, pose @ T, K).numpy(), atol=1e-2
         )
         assert node["extras"]["T_cam_from_model"] == (pose @ T).tolist()
