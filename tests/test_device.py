@@ -7,7 +7,7 @@ from torch.testing import assert_close
 import curvireg_torch as cr
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import CAMERA, bank_of, scene, truck_bank
+from tests._support import CAMERA, bank_of, scene, truck_bank
 
 VIEWS = cr.sample_views(azimuth_step=45, elevations=[10, 40])
 MODULES = [cr.ApparentRidges, cr.AverageShadingGradient, cr.DepthCurvilinearSaliency, cr.EdgeBlur]

@@ -7,7 +7,7 @@ import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evidence import RANK_ALONE, Evidence, EvidenceWeights
-from tests._support.numbers import double
+from tests._support import double
 
 NAMES = [field.name for field in fields(Evidence)]
 

@@ -25,7 +25,7 @@ from curvireg_torch.pipeline import (
 )
 from curvireg_torch.terms import TERMS, Correlation, Repeatability
 from curvireg_torch.utils import choices
-from tests._support.refusals import refused
+from tests._support import refused
 
 
 @pytest.mark.parametrize("name", [*FIELDS, *DEPTH_FIELDS])

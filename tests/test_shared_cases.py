@@ -22,8 +22,7 @@ from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.registration.photograph import FRACTIONS, as_photographs
 from curvireg_torch.registration.refinement import why_outside
 from curvireg_torch.utils.extras import is_installed
-from tests._support.numbers import double, eye
-from tests._support.refusals import refused
+from tests._support import double, eye, refused
 
 from ._support.cans import can
 from ._support.real_data import real_case, real_data

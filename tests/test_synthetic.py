@@ -9,8 +9,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import demo_scene, example_mesh, random_pose, synthesize_photograph
-from tests._support.numbers import eye, seeded
-from tests._support.scenes import CAMERA, SIZE
+from tests._support import CAMERA, SIZE, eye, seeded
 
 
 def test_photograph_shows_the_colours_of_the_mesh_at_its_pose_which_must_show_the_object():

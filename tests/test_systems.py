@@ -17,7 +17,7 @@ from curvireg_torch.formats.boxes import BoxFile, PictureSize
 from curvireg_torch.formats.masks import mask_file
 from curvireg_torch.formats.meshes.source import MeshSource
 from curvireg_torch.utils.files import split_name
-from tests._support.scenes import CAMERA, scene, truck_registrar
+from tests._support import CAMERA, scene, truck_registrar
 
 ROOT = Path(__file__).parents[1]
 UNIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}

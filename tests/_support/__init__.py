@@ -1,0 +1,26 @@
+"""What many tests use: small scenes, numbers, and refusals."""
+
+# ruff: noqa: F401
+from tests._support.numbers import double, eye, seeded, uniform
+from tests._support.quick import slow_after
+from tests._support.refusals import refused
+from tests._support.scenes import (
+    CAMERA,
+    SIZE,
+    answer_of,
+    bank_of,
+    bytes_bgr,
+    degrees_off,
+    errors,
+    found_in,
+    learned_registrar,
+    scene,
+    seen_from,
+    sequence,
+    truck_bank,
+    truck_registrar,
+    two_trucks,
+    unrefined,
+    write_photo,
+    write_video,
+)

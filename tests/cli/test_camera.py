@@ -12,9 +12,9 @@ from curvireg_torch import Camera, Registration, camera_matrix
 from curvireg_torch.cli import main
 from curvireg_torch.cli.register import NONE_RELIABLE, SOME_FAILED
 from curvireg_torch.errors import InvalidInputError
+from tests._support import scene, write_photo
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, check_pose, lines, written
-from tests._support.scenes import scene, write_photo
 from tests.registration.test_cameras_and_masks import distorted
 
 

@@ -23,8 +23,7 @@ from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import DEFAULT, PRESETS, ViewPolicy
 from scripts.robustness.wrong_inputs import cases
-from tests._support.numbers import double
-from tests._support.scenes import truck_bank
+from tests._support import double, truck_bank
 from tests._support.small import SMALL
 from tests.viewer.test_session import write_scene
 

@@ -16,11 +16,10 @@ from curvireg_torch.data import Video
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Follower
 from curvireg_torch.visualization import OverlayVideo
+from tests._support import learned_registrar, sequence, slow_after, write_photo, write_video
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, check_pose, table
-from tests._support.quick import slow_after
 from tests._support.results import registration
-from tests._support.scenes import learned_registrar, sequence, write_photo, write_video
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,9 @@ from curvireg_torch.jobs import photograph
 from curvireg_torch.jobs.lists import list_photographs, read_list
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.pipeline import PRESETS
+from tests._support import scene, truck_bank, write_video
 from tests._support.exif import exif
 from tests._support.lists import CAMERA, RESULTS, box_of, check_pose, lines, table, written
-from tests._support.scenes import scene, truck_bank, write_video
 
 HEADER = "photo,x0,y0,x1,y1"
 EMPTY = [""] * 4

@@ -7,9 +7,8 @@ import pytest
 from curvireg_torch.cli import main
 from curvireg_torch.formats.exports.ros import FILES
 from curvireg_torch.jobs.outputs import MARKER, output_folder
+from tests._support import scene, slow_after, write_video
 from tests._support.lists import CAMERA, box_of, lines, table, written
-from tests._support.quick import slow_after
-from tests._support.scenes import scene, write_video
 
 SOURCES = [
     ("left/shot.png", "right/shot.png"),

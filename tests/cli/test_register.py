@@ -15,10 +15,8 @@ from curvireg_torch.cli.register import _advice, _print_rivals, _write_pose, pri
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
+from tests._support import bank_of, double, scene, slow_after, truck_bank
 from tests._support.lists import CAMERA, box_of, check_pose
-from tests._support.numbers import double
-from tests._support.quick import slow_after
-from tests._support.scenes import bank_of, scene, truck_bank
 
 
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):

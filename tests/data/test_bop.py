@@ -7,8 +7,8 @@ from torch.testing import assert_close
 
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import MissingFileError
+from tests._support import refused
 from tests._support.miniature import write_bop, write_mesh
-from tests._support.refusals import refused
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ from curvireg_torch.data import BOPDataset, Pascal3DPlus, PoseFolder, crops
 from curvireg_torch.data.crops import UNKNOWN_CLASS, viewpoint_bins
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.crops import crop_images
+from tests._support import refused
 from tests._support.miniature import write_bop, write_pascal3d, write_web
-from tests._support.refusals import refused
 
 
 @pytest.fixture(params=["pascal", "bop", "web"])

@@ -5,8 +5,8 @@ from torch.utils.data import DataLoader
 from curvireg_torch.data import PoseFolder
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint
+from tests._support import slow_after
 from tests._support.miniature import write_mesh, write_web
-from tests._support.quick import slow_after
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from curvireg_torch import cli
 from curvireg_torch.geometry import rotation_error, transform
 from curvireg_torch.geometry.cameras import pose_from_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support.numbers import double, seeded
+from tests._support import double, seeded
 
 from .._support import miniature
 from .._support.exif import exif, with_exif

@@ -10,8 +10,8 @@ from scipy.stats import binom
 from curvireg_torch.cli import main
 from curvireg_torch.errors import MissingFileError
 from curvireg_torch.evaluation.compare import compare, in_words, read_run
+from tests._support import refused
 from tests._support.lists import written
-from tests._support.refusals import refused
 
 
 def write_run(

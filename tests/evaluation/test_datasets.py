@@ -12,8 +12,8 @@ from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
 from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Registrar
+from tests._support import double, eye
 from tests._support.lists import bop_poses, table
-from tests._support.numbers import double, eye
 from tests._support.small import SMALL, rows_of, run
 
 

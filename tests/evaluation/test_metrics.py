@@ -14,7 +14,7 @@ from torch.testing import assert_close
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import metrics
 from curvireg_torch.geometry import rotation_error
-from tests._support.numbers import double, eye, seeded, uniform
+from tests._support import double, eye, seeded, uniform
 from tests._support.poses import poses, rotations
 
 K = double([[600.0, 0.0, 320.0], [0.0, 620.0, 240.0], [0.0, 0.0, 1.0]])

@@ -13,10 +13,9 @@ from curvireg_torch.evaluation.datasets import report
 from curvireg_torch.evaluation.detection import copy_shown, detection_recall
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
 from curvireg_torch.jobs.store import ResultStore, to_json
+from tests._support import double, refused
 from tests._support.lists import bop_poses, table
 from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
-from tests._support.numbers import double
-from tests._support.refusals import refused
 
 SECONDS = {"bank": 2.0, "register": 0.5}
 PICTURE = {"width": 80, "height": 60}

@@ -15,7 +15,7 @@ from curvireg_torch.evaluation.bop import same_instances
 from curvireg_torch.geometry import transform
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import CAMERA, write_photo
+from tests._support import CAMERA, write_photo
 from tests._support.small import rows_of, run
 from tests.registration.test_several import WORLD, photograph
 

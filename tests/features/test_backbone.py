@@ -15,7 +15,7 @@ from curvireg_torch.features import backbone
 from curvireg_torch.features.backbone import Backbone, describe, similarity
 from curvireg_torch.synthetic import procedural_background
 from curvireg_torch.utils.files import tensor_checksum
-from tests._support.numbers import seeded
+from tests._support import seeded
 
 from .._support.layer_contract import LayerCase, LayerContract
 from ..filters.layer_cases import colour_photos, photos

@@ -11,7 +11,7 @@ from curvireg_torch import features
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.features import field_points, hog
 from curvireg_torch.filters import ImageGradient, image_gradient
-from tests._support.numbers import seeded
+from tests._support import seeded
 
 from ..filters.layer_cases import photos
 

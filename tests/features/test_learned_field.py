@@ -15,8 +15,7 @@ from curvireg_torch.errors import MissingFileError
 from curvireg_torch.features import LearnedCurvilinearSaliency, doubled_angle, halved_angle
 from curvireg_torch.features.backbone import Backbone, describe
 from curvireg_torch.features.learned_field import FieldNetwork, save_weights
-from tests._support.numbers import seeded, uniform
-from tests._support.refusals import refused
+from tests._support import refused, seeded, uniform
 
 from .._support.layer_contract import LayerCase, LayerContract
 from .._support.quick import slow_after

@@ -4,7 +4,7 @@ contract."""
 import torch
 
 from curvireg_torch import features, filters
-from tests._support.numbers import seeded
+from tests._support import seeded
 
 from .._support.layer_contract import LayerCase
 

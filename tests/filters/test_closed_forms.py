@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from curvireg_torch import filters
 from curvireg_torch.filters.focus import MODES
-from tests._support.numbers import double, seeded
+from tests._support import double, seeded
 
 from .layer_cases import cylinder, grid, plane, sphere
 

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from curvireg_torch import filters
 from curvireg_torch.filters import operations as ops
-from tests._support.numbers import double
+from tests._support import double
 
 LAYERS = {
     "ImageGradient": filters.ImageGradient(),

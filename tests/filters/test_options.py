@@ -13,8 +13,7 @@ from torch.testing import assert_close
 import curvireg_torch as cr
 from curvireg_torch import filters
 from curvireg_torch.errors import InvalidInputError
-from tests._support.numbers import double
-from tests._support.refusals import refused
+from tests._support import double, refused
 
 from .layer_cases import CAMERA, PAIRS, depths, photos
 

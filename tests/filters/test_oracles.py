@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from curvireg_torch import filters
 from curvireg_torch.filters.curvilinear import dominant_eigenvector, scaled_direction
 from curvireg_torch.filters.operations import central_derivatives, smooth
-from tests._support.numbers import double, eye, seeded
+from tests._support import double, eye, seeded
 
 from .layer_cases import depths, photos
 

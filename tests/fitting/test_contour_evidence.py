@@ -9,7 +9,7 @@ from curvireg_torch.fitting.edges import CROP_SIZE, EdgeCrops
 from curvireg_torch.fitting.measured_fit import contour_evidence, contour_support
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.rendering.contours import MeshContours
-from tests._support.numbers import double, eye, seeded
+from tests._support import double, eye, seeded
 
 K = double([[4000.0, 0.0, 99.5], [0.0, 4000.0, 99.5], [0.0, 0.0, 1.0]])
 FRONT = transform(eye(3), double([0.0, 0.0, 40.0]))

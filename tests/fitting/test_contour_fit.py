@@ -20,8 +20,7 @@ from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.terms import crop_photographs
-from tests._support.numbers import double, eye, seeded
-from tests._support.quick import slow_after
+from tests._support import double, eye, seeded, slow_after
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, fitted, noise, pose, silhouette
 
 CENTRE = double([0.2, -0.1, 0.3])

@@ -14,8 +14,7 @@ from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import synthesize_photograph
-from tests._support.numbers import double, eye, seeded
-from tests._support.scenes import CAMERA, SIZE
+from tests._support import CAMERA, SIZE, double, eye, seeded
 
 TURN = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
 

@@ -10,7 +10,7 @@ from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.rendering.contours import MeshContours
-from tests._support.numbers import double, eye
+from tests._support import double, eye
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, silhouette
 
 

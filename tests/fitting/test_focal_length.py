@@ -15,8 +15,7 @@ from curvireg_torch.fitting.measured_fit import FULL_SIZE_RADII
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.geometry.cameras import projected
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support.numbers import double, seeded
-from tests._support.scenes import SIZE, scene, truck_registrar
+from tests._support import SIZE, double, scene, seeded, truck_registrar
 
 NEAR = camera_matrix(150.0, 150.0, 119.5, 89.5)  # a wide angle, from where perspective is strong
 

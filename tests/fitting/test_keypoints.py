@@ -24,9 +24,7 @@ from curvireg_torch.registration.hypotheses import fit_poses, placed
 from curvireg_torch.registration.photograph import as_photographs
 from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background
-from tests._support.numbers import double, eye, seeded
-from tests._support.quick import slow_after
-from tests._support.scenes import degrees_off
+from tests._support import degrees_off, double, eye, seeded, slow_after
 
 SIZE = (360, 480)
 K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)

@@ -15,7 +15,7 @@ from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.rendering.contours import ContourPoints
-from tests._support.numbers import double, eye, seeded, uniform
+from tests._support import double, eye, seeded, uniform
 from tests.fitting.cube import K, fitted, pose, silhouette
 
 ZERO = double([0.0, 0.0, 0.0])

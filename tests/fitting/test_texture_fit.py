@@ -27,10 +27,8 @@ from curvireg_torch.mesh.mesh import extreme_points, mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.contours import MeshContours
+from tests._support import CAMERA, double, slow_after
 from tests._support.cans import can, photograph
-from tests._support.numbers import double
-from tests._support.quick import slow_after
-from tests._support.scenes import CAMERA
 
 MESH = can()
 R = rotation_from_viewpoint(*double((17.0, 22.0, 0.0))) @ up_rotation("y")

@@ -5,8 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from curvireg_torch.geometry import Camera, camera_matrix, project_points, undistorted
-from tests._support.numbers import double, eye, seeded
-from tests._support.refusals import refused
+from tests._support import double, eye, refused, seeded
 
 SIZE = (120, 160)
 MATRIX = camera_matrix(110.0, 112.0, 77.0, 61.0)

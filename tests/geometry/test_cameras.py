@@ -11,7 +11,7 @@ from curvireg_torch.geometry.cameras import point_in_cameras, pose_around
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
-from tests._support.numbers import double, eye, seeded
+from tests._support import double, eye, seeded
 
 K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
 

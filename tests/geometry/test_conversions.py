@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
-from tests._support.numbers import double, eye
+from tests._support import double, eye
 
 
 def test_opengl_cameras_look_backward_with_y_up():

@@ -8,7 +8,7 @@ from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry.crops import check_boxes, crop_squares, image_transforms
 from curvireg_torch.utils.checks import check_camera_matrix
-from tests._support.numbers import double, eye
+from tests._support import double, eye
 
 
 def ramp(height, width):

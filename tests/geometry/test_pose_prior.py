@@ -5,8 +5,7 @@ import torch
 
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import PosePrior, object_frame
-from tests._support.numbers import eye, uniform
-from tests._support.refusals import refused
+from tests._support import eye, refused, uniform
 
 
 def rotations(azimuth, elevation=0.0, theta=0.0):

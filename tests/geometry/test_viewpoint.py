@@ -18,7 +18,7 @@ from curvireg_torch.geometry import (
 )
 from curvireg_torch.geometry.viewpoint import angles_between
 from curvireg_torch.utils.choices import UP_AXES
-from tests._support.numbers import double, eye, seeded
+from tests._support import double, eye, seeded
 
 
 @pytest.mark.parametrize(

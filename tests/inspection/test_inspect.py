@@ -32,9 +32,7 @@ from curvireg_torch.inspection.trial import Expected, Outcome, Trial, run_trial
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.registration import Registrar
 from curvireg_torch.synthetic import example_mesh
-from tests._support.numbers import double, eye
-from tests._support.quick import slow_after
-from tests._support.scenes import bank_of
+from tests._support import bank_of, double, eye, slow_after
 
 
 def plate(size, at):

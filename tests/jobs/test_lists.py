@@ -20,10 +20,18 @@ from curvireg_torch.jobs.lists import find_photographs, list_photographs, read_l
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh
+from tests._support import (
+    SIZE,
+    double,
+    eye,
+    found_in,
+    refused,
+    scene,
+    two_trucks,
+    unrefined,
+    write_photo,
+)
 from tests._support.lists import table
-from tests._support.numbers import double, eye
-from tests._support.refusals import refused
-from tests._support.scenes import SIZE, found_in, scene, two_trucks, unrefined, write_photo
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
 LENS = replace(CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0))

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from curvireg_torch.jobs.outputs import FILES, MARKER, check_output_file, output_folder
-from tests._support.refusals import refused
+from tests._support import refused
 
 
 def marked(folder):

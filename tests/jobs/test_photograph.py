@@ -16,9 +16,9 @@ from curvireg_torch.data import Photo
 from curvireg_torch.jobs import photograph
 from curvireg_torch.jobs.entry import Entry, prepare
 from curvireg_torch.jobs.outputs import MARKER
+from tests._support import found_in, learned_registrar, scene, two_trucks
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, write_files
-from tests._support.scenes import found_in, learned_registrar, scene, two_trucks
 
 
 @pytest.fixture(scope="module")

@@ -17,10 +17,9 @@ from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.jobs.photograph import prepare_views
 from curvireg_torch.jobs.rigs import read_rig
 from curvireg_torch.utils.files import only_in
+from tests._support import double, eye, refused
 from tests._support.doubling import check_linear
 from tests._support.lists import written
-from tests._support.numbers import double, eye
-from tests._support.refusals import refused
 
 POSE = [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1]
 COLUMNS = "photo,camera," + ",".join((*rigs.ROTATION, *rigs.TRANSLATION))

@@ -5,7 +5,7 @@ import pytest
 
 from curvireg_torch.errors import OutputError
 from curvireg_torch.jobs.store import ResultStore
-from tests._support.refusals import refused
+from tests._support import refused
 
 DIGESTS = {"request": "a", "photo": "b"}
 

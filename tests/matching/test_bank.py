@@ -24,8 +24,7 @@ from curvireg_torch.pipeline import Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Correlation
 from curvireg_torch.utils.files import tensor_checksum
-from tests._support.numbers import seeded
-from tests._support.scenes import learned_registrar, scene
+from tests._support import learned_registrar, scene, seeded
 
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
 

@@ -9,7 +9,7 @@ from curvireg_torch import Pipeline, ViewMatcher, sample_views
 from curvireg_torch.matching import cached_bank, clear_cache, list_cache
 from curvireg_torch.matching.cells import DescribedViews, best_cells, cells_of_views
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import scene
+from tests._support import scene
 
 
 def test_every_view_belongs_to_its_nearest_representative():

@@ -14,8 +14,7 @@ from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, sa
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.terms import Appearance, Correlation, Repeatability
-from tests._support.numbers import double, eye
-from tests._support.scenes import scene
+from tests._support import double, eye, scene
 
 
 @pytest.fixture(scope="module")

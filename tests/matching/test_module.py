@@ -12,9 +12,7 @@ from curvireg_torch import Registrar, ViewMatcher, terms
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.registration import Follower
 from curvireg_torch.terms import Correlation, QueryFeatures
-from tests._support.quick import slow_after
-from tests._support.refusals import refused
-from tests._support.scenes import CAMERA, scene, sequence
+from tests._support import CAMERA, refused, scene, sequence, slow_after
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,7 @@ from curvireg_torch.mesh import normalization_transform
 from curvireg_torch.mesh.edges import MeshEdges, encloses_volumes, simplified
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, principal_rotation
 from curvireg_torch.rendering.contours import MeshContours
-from tests._support.numbers import double, eye, seeded
-from tests._support.refusals import refused
+from tests._support import double, eye, refused, seeded
 
 
 @pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (1.0, 0.9, 0.02), (1.0, 0.05, 0.05)])

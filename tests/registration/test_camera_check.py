@@ -9,8 +9,7 @@ from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.camera import focal_contradiction
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support.numbers import seeded
-from tests._support.scenes import learned_registrar, seen_from
+from tests._support import learned_registrar, seeded, seen_from
 
 SIZE = (360, 480)
 FOCAL = 400.0

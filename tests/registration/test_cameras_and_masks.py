@@ -17,9 +17,17 @@ from curvireg_torch.geometry.cameras import boxes_around
 from curvireg_torch.registration import FailedRegistration, Follower, detect
 from curvireg_torch.registration.photograph import as_photograph, as_photographs
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from tests._support.numbers import eye, seeded
-from tests._support.quick import slow_after
-from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_registrar
+from tests._support import (
+    CAMERA,
+    SIZE,
+    errors,
+    eye,
+    learned_registrar,
+    scene,
+    seeded,
+    slow_after,
+    truck_registrar,
+)
 
 # The object, in the middle of the picture, is 20 degrees off its axis, where distortion moves it
 OFF_CENTRE = camera_matrix(260.0, 260.0, 20.0, 30.0)

@@ -15,10 +15,18 @@ from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import confidence
 from curvireg_torch.synthetic import procedural_background
-from tests._support.numbers import double, seeded
-from tests._support.quick import slow_after
+from tests._support import (
+    CAMERA,
+    SIZE,
+    answer_of,
+    double,
+    learned_registrar,
+    scene,
+    seeded,
+    slow_after,
+    truck_registrar,
+)
 from tests._support.results import FEATURES
-from tests._support.scenes import CAMERA, SIZE, answer_of, learned_registrar, scene, truck_registrar
 
 R30 = sample_views(azimuth_step=12, elevations=[0]).rotations
 

@@ -12,8 +12,7 @@ from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration.block import Described, counting_keypoints, evidence_of
 from curvireg_torch.registration.hypotheses import Hypotheses
-from tests._support.numbers import double, eye
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene
+from tests._support import CAMERA, SIZE, double, eye, learned_registrar, scene
 
 
 def frame_of(target, box):

@@ -24,10 +24,7 @@ from curvireg_torch.registration.detection import RegisteredBox, _add, _allowed_
 from curvireg_torch.registration.photograph import Photograph
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from curvireg_torch.visualization.words import corners
-from tests._support.numbers import double, seeded
-from tests._support.quick import slow_after
-from tests._support.refusals import refused
-from tests._support.scenes import CAMERA, scene, unrefined
+from tests._support import CAMERA, double, refused, scene, seeded, slow_after, unrefined
 
 SIZE = (240, 320)
 FOCAL = float(CAMERA[0, 0])

@@ -8,7 +8,7 @@ import torch
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import CAMERA, scene, unrefined
+from tests._support import CAMERA, scene, unrefined
 
 IMAGES = [scene(seed)[0] for seed in (0, 1)]
 BOXES = torch.stack([scene(seed)[1] for seed in (0, 1)])

@@ -12,9 +12,8 @@ from curvireg_torch.geometry.cameras import rotation_towards
 from curvireg_torch.registration.camera import principal_covariance
 from curvireg_torch.registration.hypotheses import Hypotheses, placed
 from curvireg_torch.visualization.words import remarks
-from tests._support.numbers import double, eye, seeded
+from tests._support import CAMERA, double, eye, seeded
 from tests._support.results import registration
-from tests._support.scenes import CAMERA
 
 COVARIANCE = torch.diag(double([0.02, 0.05, 0.03, 1.0, 2.0, 8.0]).square())
 CENTRE = double([20.0, -30.0, 10.0])

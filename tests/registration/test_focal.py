@@ -15,13 +15,14 @@ from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.hypotheses import Hypotheses, projected_box
 from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from tests._support.numbers import double, seeded
-from tests._support.scenes import (
+from tests._support import (
     CAMERA,
     SIZE,
     degrees_off,
+    double,
     learned_registrar,
     scene,
+    seeded,
     truck_registrar,
 )
 from tests.fitting.test_focal_length import NEAR, near_scene

@@ -16,10 +16,18 @@ from curvireg_torch.geometry.cameras import pose_around
 from curvireg_torch.registration import FailedRegistration, Follower, refine, tracking
 from curvireg_torch.registration.tracking import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
-from tests._support.numbers import double, seeded
-from tests._support.quick import slow_after
-from tests._support.refusals import refused
-from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, sequence, truck_registrar
+from tests._support import (
+    CAMERA,
+    SIZE,
+    double,
+    errors,
+    learned_registrar,
+    refused,
+    seeded,
+    sequence,
+    slow_after,
+    truck_registrar,
+)
 
 LOST = Mock(side_effect=LostObjectError("lost"))
 

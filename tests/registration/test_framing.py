@@ -19,9 +19,17 @@ from curvireg_torch.geometry.framing import (
 )
 from curvireg_torch.registration.judging import outside_warnings
 from curvireg_torch.registration.photograph import as_photograph
-from tests._support.numbers import double, eye
-from tests._support.quick import slow_after
-from tests._support.scenes import CAMERA, SIZE, answer_of, errors, learned_registrar, scene
+from tests._support import (
+    CAMERA,
+    SIZE,
+    answer_of,
+    double,
+    errors,
+    eye,
+    learned_registrar,
+    scene,
+    slow_after,
+)
 
 SQUARE = torch.from_numpy(trimesh.creation.box((1.0, 1.0, 0.001)).vertices.copy())
 K = camera_matrix(100.0, 100.0, 49.5, 39.5, dtype=torch.float64)

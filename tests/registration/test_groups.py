@@ -14,10 +14,9 @@ from curvireg_torch.registration.judging import Rivals, axis_of, directions_agre
 from curvireg_torch.registration.result import AXIS_TOLERANCE, Axis
 from curvireg_torch.visualization.contours import AXIS
 from curvireg_torch.visualization.overlay import contour_overlay, registration_sheet
+from tests._support import answer_of, double
 from tests._support.canisters import canister
-from tests._support.numbers import double
 from tests._support.results import FEATURES, registration
-from tests._support.scenes import answer_of
 from tests.registration.test_ties import hollow_box, photograph, registrar_of
 
 UPRIGHT = RoundAxis(double([0.0, 0.0, 1.0]), torch.zeros(3).double(), False)

@@ -6,7 +6,7 @@ import torch
 
 from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.registration.hypotheses import Hypotheses
-from tests._support.numbers import double, eye
+from tests._support import double, eye
 
 WEIGHTS = EvidenceWeights.only(similarity=10.0)
 

@@ -12,14 +12,7 @@ from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration import Registrar, stages
 from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration.photograph import Photograph, as_photographs, camera_warnings
-from tests._support.scenes import (
-    CAMERA,
-    SIZE,
-    learned_registrar,
-    scene,
-    truck_registrar,
-    write_photo,
-)
+from tests._support import CAMERA, SIZE, learned_registrar, scene, truck_registrar, write_photo
 
 VGA = (480, 640)
 

@@ -11,9 +11,8 @@ from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import judged
+from tests._support import CAMERA, SIZE, double
 from tests._support.hypotheses import evidence_of, poses_at, turned
-from tests._support.numbers import double
-from tests._support.scenes import CAMERA, SIZE
 
 HULL = 0.3 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 BOX = torch.tensor([90.0, 60.0, 150.0, 120.0])

@@ -8,8 +8,8 @@ from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
 from curvireg_torch.registration import judging
 from curvireg_torch.registration.hypotheses import Hypotheses
+from tests._support import CAMERA, answer_of, learned_registrar, scene
 from tests._support.poses import poses as random_poses
-from tests._support.scenes import CAMERA, answer_of, learned_registrar, scene
 
 
 def chiral_mesh():

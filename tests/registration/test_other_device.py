@@ -9,7 +9,7 @@ from curvireg_torch.rendering.visibility import FaceTests
 from curvireg_torch.rendering.zbuffer import DeviceRenderer
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.terms import Appearance
-from tests._support.scenes import CAMERA, learned_registrar, scene
+from tests._support import CAMERA, learned_registrar, scene
 
 VIEWS = cr.sample_views(azimuth_step=45, elevations=[0, 30])
 AGREES = 0.05  # degrees

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration.hypotheses import Hypotheses, best_views, distinct_poses
-from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
+from tests._support import CAMERA, scene, truck_bank, truck_registrar
 
 
 def rotation(x, y, z):

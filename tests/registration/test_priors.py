@@ -20,9 +20,16 @@ from curvireg_torch.geometry.pose_prior import PosePrior
 from curvireg_torch.registration.block import Limits
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.photograph import Photograph
-from tests._support.numbers import double, eye
-from tests._support.quick import slow_after
-from tests._support.scenes import CAMERA, learned_registrar, scene, truck_bank, truck_registrar
+from tests._support import (
+    CAMERA,
+    double,
+    eye,
+    learned_registrar,
+    scene,
+    slow_after,
+    truck_bank,
+    truck_registrar,
+)
 
 IMAGE, BOX, T = scene(0)
 ONE = ([IMAGE], BOX[None], CAMERA)

@@ -10,9 +10,17 @@ from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, transform
 from curvireg_torch.registration import refinement
 from curvireg_torch.synthetic import procedural_background, synthesize_photograph
-from tests._support.numbers import double, seeded
-from tests._support.quick import slow_after
-from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_bank
+from tests._support import (
+    CAMERA,
+    SIZE,
+    double,
+    errors,
+    learned_registrar,
+    scene,
+    seeded,
+    slow_after,
+    truck_bank,
+)
 
 
 @pytest.fixture(scope="module")

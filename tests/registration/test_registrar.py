@@ -27,16 +27,17 @@ from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration.photograph import Photograph, check_crop
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support.numbers import double, seeded
-from tests._support.scenes import (
+from tests._support import (
     CAMERA,
     SIZE,
     answer_of,
     bank_of,
     degrees_off,
+    double,
     errors,
     learned_registrar,
     scene,
+    seeded,
     seen_from,
     truck_bank,
     truck_registrar,

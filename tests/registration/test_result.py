@@ -11,7 +11,7 @@ from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration.result import Axis, ambiguity, likely_rivals
-from tests._support.numbers import double, eye
+from tests._support import double, eye
 from tests._support.results import registration
 
 

@@ -14,8 +14,8 @@ from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import rig as rig_module
 from curvireg_torch.registration.rig import ELSEWHERE, Rig, RigPhotograph, RigProblem
+from tests._support import double
 from tests._support.hypotheses import evidence_of
-from tests._support.numbers import double
 
 LOST_CONFIDENCE = Pipeline().fit.lost_confidence
 CENTRE = double([0.2, -0.1, 0.3])

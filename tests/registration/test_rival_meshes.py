@@ -13,9 +13,8 @@ from curvireg_torch.errors import LostObjectError
 from curvireg_torch.fitting.details import ContourDetails
 from curvireg_torch.registration import FailedRegistration, judging
 from curvireg_torch.registration.judging import best_of_meshes, joined
-from tests._support.quick import slow_after
+from tests._support import CAMERA, learned_registrar, slow_after
 from tests._support.results import registration
-from tests._support.scenes import CAMERA, learned_registrar
 from tests.registration.test_ties import photograph
 
 

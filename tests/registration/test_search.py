@@ -25,8 +25,7 @@ from curvireg_torch.mesh.mesh import principal_rotation
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.registration import block, hypotheses, stages
 from curvireg_torch.terms import Appearance
-from tests._support.numbers import double, eye
-from tests._support.scenes import CAMERA, bank_of, scene, truck_bank
+from tests._support import CAMERA, bank_of, double, eye, scene, truck_bank
 
 
 def test_coherent_views_are_connected_with_the_best_by_neighbours():

@@ -11,10 +11,17 @@ from curvireg_torch import Registrar, rotation_error
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
-from tests._support.numbers import double, eye, seeded
-from tests._support.quick import slow_after
-from tests._support.refusals import refused
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, seen_from
+from tests._support import (
+    CAMERA,
+    SIZE,
+    double,
+    eye,
+    learned_registrar,
+    refused,
+    seeded,
+    seen_from,
+    slow_after,
+)
 
 EASY = ((100.0, 1), (135.0, 2), (175.0, 3))
 # Azimuths and seeds of photographs; those of the second rig, with strong noise, are registered the

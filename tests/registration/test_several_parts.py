@@ -14,7 +14,7 @@ from curvireg_torch.registration import several
 from curvireg_torch.registration.confidence import hypothesis_probabilities
 from curvireg_torch.registration.photograph import as_photograph, copies_of
 from curvireg_torch.registration.rig import JointPoses
-from tests._support.numbers import double, eye
+from tests._support import double, eye
 
 ANY_RIGHT = 0.8
 EYE = eye(4)

@@ -15,9 +15,8 @@ from curvireg_torch.registration import judging
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import Siblings
 from curvireg_torch.registration.target import TellingSymmetries
+from tests._support import CAMERA, double, eye
 from tests._support.hypotheses import evidence_of
-from tests._support.numbers import double, eye
-from tests._support.scenes import CAMERA
 
 
 def four(similarity, compare, angles):

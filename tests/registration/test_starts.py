@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch.registration.photograph import MIN_BOX_SIDE
 from curvireg_torch.registration.refinement import INVERSE, OPENGL, why_outside
-from tests._support.numbers import double, eye
+from tests._support import double, eye
 
 SIZE = (180, 240)
 K = double([[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]])

@@ -14,9 +14,7 @@ from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from curvireg_torch.registration.target import MAX_SIBLINGS, spread, telling_symmetries
 from curvireg_torch.synthetic import synthesize_photograph
-from tests._support.numbers import eye, seeded
-from tests._support.quick import slow_after
-from tests._support.scenes import CAMERA, SIZE, bank_of, seen_from
+from tests._support import CAMERA, SIZE, bank_of, eye, seeded, seen_from, slow_after
 
 
 @cache

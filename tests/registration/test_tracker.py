@@ -32,8 +32,7 @@ from curvireg_torch.registration.tracking import FLOW_SCALES, Tracker
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
-from tests._support.numbers import double, eye, seeded
-from tests._support.scenes import CAMERA, sequence
+from tests._support import CAMERA, double, eye, seeded, sequence
 from tests.fitting.cube import cube, pose
 
 K = camera_matrix(500.0, 500.0, 159.5, 119.5, dtype=torch.float64)

@@ -10,7 +10,7 @@ from curvireg_torch.fitting.regions import RegionModel
 from curvireg_torch.geometry.framing import boxes_at
 from curvireg_torch.registration import tracking
 from curvireg_torch.registration.tracking import Tracker
-from tests._support.numbers import double
+from tests._support import double
 from tests.fitting.cube import pose
 
 K = double([[200.0, 0, 99.5], [0, 200.0, 49.5], [0, 0, 1]])

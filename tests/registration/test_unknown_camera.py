@@ -17,10 +17,9 @@ from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.photograph import Photograph
+from tests._support import CAMERA, SIZE, double
 from tests._support import hypotheses as support
 from tests._support.hypotheses import evidence_of
-from tests._support.numbers import double
-from tests._support.scenes import CAMERA, SIZE
 
 NOTHING = None
 CENTRE = double([0.3, -0.2, 0.4])

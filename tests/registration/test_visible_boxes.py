@@ -17,8 +17,7 @@ from curvireg_torch.geometry.framing import (
 from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.registration.rig import RigPhotograph
 from curvireg_torch.registration.stages import _other_box, describe, rank
-from tests._support.numbers import double, eye
-from tests._support.scenes import CAMERA, SIZE, answer_of, errors, learned_registrar, scene
+from tests._support import CAMERA, SIZE, answer_of, double, errors, eye, learned_registrar, scene
 
 
 def visible_registrar(**changes):

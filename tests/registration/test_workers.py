@@ -9,7 +9,7 @@ from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration.photograph import OnDemand
 from curvireg_torch.registration.registrar import _register_by_workers
 from curvireg_torch.utils.executors import Workers
-from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
+from tests._support import CAMERA, scene, truck_bank, truck_registrar
 
 
 class EndsItsProcess:

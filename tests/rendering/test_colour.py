@@ -10,7 +10,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import as_mesh, load_mesh
 from curvireg_torch.rendering import make_renderer, render_colour, shade
-from tests._support.numbers import double
+from tests._support import double
 
 COLOURS = [
     (230, 20, 20),

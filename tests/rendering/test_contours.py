@@ -10,7 +10,7 @@ import trimesh
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.rendering.contours import MAX_OCCLUDING, MeshContours, _spread_evenly
-from tests._support.numbers import double, eye
+from tests._support import double, eye
 
 K = double([[220.0, 0, 63.5], [0, 220.0, 63.5], [0, 0, 1]])
 

@@ -10,7 +10,7 @@ import trimesh
 
 from curvireg_torch.geometry import transform
 from curvireg_torch.rendering.contours import MAX_OCCLUDING, MeshContours, _Places, _Views
-from tests._support.numbers import double
+from tests._support import double
 
 SIZE = 128
 DISTANCE = 10.0

@@ -8,7 +8,7 @@ from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.rendering.visibility import FaceTests
 from curvireg_torch.rendering.zbuffer import DeviceRenderer, _groups
 from curvireg_torch.synthetic import example_mesh, random_pose
-from tests._support.numbers import double, seeded
+from tests._support import double, seeded
 
 MESHES = {
     "truck": example_mesh,

@@ -14,8 +14,7 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError, RenderingError
 from curvireg_torch.rendering import contours as contours_module
 from curvireg_torch.rendering import make_renderer
-from tests._support.numbers import double, eye
-from tests._support.refusals import refused
+from tests._support import double, eye, refused
 
 from .conftest import camera
 

@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from curvireg_torch.rendering import make_renderer
-from tests._support.quick import slow_after
+from tests._support import slow_after
 
 from .conftest import camera, require
 

@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from curvireg_torch.rendering.shading import AMBIENT, LIT, shade
-from tests._support.numbers import double
+from tests._support import double
 
 from .conftest import pixel_grid
 

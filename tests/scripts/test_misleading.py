@@ -22,7 +22,7 @@ from scripts.calibration.misleading import (
     cases_of,
     table_of,
 )
-from tests._support.numbers import double
+from tests._support import double
 
 H, W = 240, 320
 K = double([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]])

@@ -24,7 +24,7 @@ from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
 from scripts.paper.measures import bootstrap, points_within
-from tests._support.scenes import write_photo
+from tests._support import write_photo
 
 SETTINGS = BankSettings(image_size=64)
 

@@ -13,7 +13,7 @@ from curvireg_torch.features.backbone import Backbone, describe, similarity
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.terms import Appearance
-from tests._support.scenes import bank_of, scene
+from tests._support import bank_of, scene
 
 VIEWS = sample_views(azimuth_step=30, elevations=[0, 30])  # those of `small_bank`
 PIPELINE = Pipeline(field="focus", box_jitter=0.0, bank=replace(Pipeline().bank, image_size=64))

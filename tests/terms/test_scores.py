@@ -12,9 +12,7 @@ from torch.testing import assert_close
 
 from curvireg_torch import ViewMatcher, terms
 from curvireg_torch.features import LearnedCurvilinearSaliency
-from tests._support.numbers import seeded
-from tests._support.refusals import refused
-from tests._support.scenes import scene
+from tests._support import refused, scene, seeded
 
 
 def test_correlation_is_the_cosine_of_the_better_crop_scored_by_standard_deviations():

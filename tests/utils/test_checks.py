@@ -9,8 +9,7 @@ import curvireg_torch as cr
 from curvireg_torch import errors, geometry
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.utils import checks
-from tests._support.numbers import double, eye, seeded
-from tests._support.refusals import refused
+from tests._support import double, eye, refused, seeded
 
 CAMERA = double([[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]])
 POSE = geometry.transform(cr.rotation_from_viewpoint(30.0, 20.0).double(), double([0.1, 0.2, 6.0]))

@@ -12,7 +12,7 @@ from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError, MissingFileError, OutputError
 from curvireg_torch.utils import files
 from curvireg_torch.utils.files import as_stored, file_name, found_in, only_in
-from tests._support.refusals import refused
+from tests._support import refused
 
 OLD = b"a" * 1000
 NEW = b"b" * 5_000_000

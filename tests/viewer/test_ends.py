@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
-from tests._support.scenes import scene, write_photo
+from tests._support import scene, write_photo
 
 BROWSER = """#!/bin/sh
 printf '%s' "$*" > "$SEEN.new"

@@ -22,8 +22,8 @@ from curvireg_torch.errors import LostObjectError
 from curvireg_torch.registration import FailedRegistration, Follower
 from curvireg_torch.viewer.live import LivePage
 from curvireg_torch.visualization.contours import OUTLINE
+from tests._support import bytes_bgr, learned_registrar, sequence
 from tests._support.lists import CAMERA
-from tests._support.scenes import bytes_bgr, learned_registrar, sequence
 
 
 def camera(frames, taken):

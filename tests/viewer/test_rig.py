@@ -21,9 +21,8 @@ from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as session_module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.workspace import Workspace
+from tests._support import double, learned_registrar
 from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos, written
-from tests._support.numbers import double
-from tests._support.scenes import learned_registrar
 from tests.registration.test_several import WORLD
 from tests.viewer.test_workspace import upload
 

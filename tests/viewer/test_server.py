@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests._support.refusals import refused
+from tests._support import refused
 
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 

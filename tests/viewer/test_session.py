@@ -26,10 +26,8 @@ from curvireg_torch.viewer import programs
 from curvireg_torch.viewer import session as module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.shot import dragged_box
+from tests._support import double, refused, scene, write_photo
 from tests._support.exif import exif, with_exif
-from tests._support.numbers import double
-from tests._support.refusals import refused
-from tests._support.scenes import scene, write_photo
 
 VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
 

@@ -7,7 +7,7 @@ import trimesh
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.visualization.contours import contour_layer, contour_pixels
-from tests._support.numbers import double, eye
+from tests._support import double, eye
 
 FOCAL = 200.0
 SIZE = 120

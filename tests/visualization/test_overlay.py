@@ -8,7 +8,7 @@ from curvireg_torch import Registrar
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization import contour_overlay
-from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
+from tests._support import CAMERA, SIZE, scene, truck_bank
 
 GREEN = (0, 255, 80)
 

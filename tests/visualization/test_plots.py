@@ -4,7 +4,7 @@ import pytest
 from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization.plots import viewpoints
-from tests._support.scenes import CAMERA, scene, unrefined
+from tests._support import CAMERA, scene, unrefined
 
 
 def test_viewpoints_draws_the_best_score_of_each_direction_last_and_the_hypotheses():

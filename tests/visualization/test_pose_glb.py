@@ -15,8 +15,7 @@ from curvireg_torch.geometry import project_points, rotation_from_axis_angle
 from curvireg_torch.mesh import as_mesh
 from curvireg_torch.visualization import pose_glb
 from curvireg_torch.visualization.pose_glb import scene_glb
-from tests._support.numbers import eye
-from tests._support.scenes import CAMERA, SIZE, scene
+from tests._support import CAMERA, SIZE, eye, scene
 
 
 def tree_of(data):

@@ -10,7 +10,7 @@ from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization import contour_overlay, overlay, registration_sheet
-from tests._support.scenes import CAMERA, scene, truck_bank, unrefined
+from tests._support import CAMERA, scene, truck_bank, unrefined
 
 GREEN = (0, 255, 80)
 SIDE = 227  # px of a small picture: four in a row of 960 px

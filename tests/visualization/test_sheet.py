@@ -10,7 +10,7 @@ from curvireg_torch import Registrar
 from curvireg_torch.geometry import project_points
 from curvireg_torch.visualization import sheet
 from curvireg_torch.visualization.contours import close_up
-from tests._support.scenes import scene, truck_bank, unrefined
+from tests._support import scene, truck_bank, unrefined
 
 
 @pytest.mark.parametrize("scale", [1, 4])

@@ -12,7 +12,7 @@ from curvireg_torch.errors import InvalidInputError, LostObjectError, OutputErro
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.visualization import OverlayVideo
 from curvireg_torch.visualization.video import annotated_frame, caption
-from tests._support.scenes import CAMERA, scene, truck_registrar
+from tests._support import CAMERA, scene, truck_registrar
 
 LOST = FailedRegistration(LostObjectError("not near the start"))
 
