@@ -69,14 +69,14 @@ class Registrar(Target):
             ``torch.eye(4)[None]`` for none.
         device: of modules, bank and search.
         workers: processes that register photographs side by side on a CPU, from the first call on;
-            1: this one, on several threads, which share Python's interpreter lock. A script starts
-            processes within ``if __name__ == "__main__":``. They show no progress.
+            1: this one. A script starts processes within ``if __name__ == "__main__":``. They show
+            no progress.
         executor: of other workers, such as ``distributed.Client(address).get_executor()`` of a Dask
             cluster.
         progress: True shows bars. A callback gets (stage, done, total), with the stages "detection"
             (without a box), "bank", "ranking", "search" and "contours"; to cancel, it may raise
-            what is no :class:`CurviregError`. On a CPU photographs are registered in parallel:
-            callback, custom renderer and custom field are then called from several threads.
+            what is no :class:`CurviregError`. On a CPU views are drawn and described on several
+            threads, which a custom renderer and a custom field are then called from.
 
     Example:
         >>> import trimesh
