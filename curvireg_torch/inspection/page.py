@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..matching import ViewDescriber
 from ..registration import Registrar
-from ..visualization.contours import close_up, draw_window, longer_side
+from ..visualization.contours import Drawn, draw_close_up
 from ..visualization.encoding import embedded, jpeg, to_uint8
 from .facts import CONTINUOUS_TURN, MeshFacts
 from .look_alikes import LookAlike
@@ -219,12 +219,11 @@ def _confusions(outcomes: Sequence[Outcome], registrar: Registrar | None) -> str
 def _confusion_figure(outcome: Outcome, registrar: Registrar) -> str:
     assert outcome.result is not None
     image = outcome.photograph.image
-    window = close_up(image.shape[-2:], outcome.photograph.box.tolist())
-    scale = PICTURE_SIDE / longer_side(window)
-    drawn = draw_window(registrar.describer, outcome.result.projection, image, window, scale)
+    drawn = Drawn(registrar.describer, outcome.result.projection)
+    picture = draw_close_up(image, outcome.photograph.box.tolist(), PICTURE_SIDE, [drawn])
     confidence = outcome.result.confidence
     said = "" if confidence is None else f", confidence {int(100 * confidence) / 100:.2f}"
     return (
-        f"<figure>{_image(jpeg(drawn, 85))}<figcaption>{outcome.error_deg:.0f}° "
+        f"<figure>{_image(jpeg(picture, 85))}<figcaption>{outcome.error_deg:.0f}° "
         f"off{said}</figcaption></figure>"
     )

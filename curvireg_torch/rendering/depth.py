@@ -8,11 +8,12 @@ from ..mesh import Mesh, as_mesh
 from ..utils.checks import check_option
 from ..utils.choices import RENDERER_NAMES
 from ..utils.likes import MeshLike
+from .embree import EmbreeRenderer, RasterRenderer
 from .renderer import DepthRenderer
 
 
 def make_renderer(
-    mesh: Mesh | trimesh.Trimesh, backend: str | DepthRenderer = "auto", *, many_views: bool = False
+    mesh: Mesh | trimesh.Trimesh, backend: str | DepthRenderer = "auto"
 ) -> DepthRenderer:
     """A renderer of ``mesh``, or ``backend`` if it is none of these names. All agree, and may be
     shared by threads:
@@ -22,8 +23,6 @@ def make_renderer(
     - ``"embree"`` casts rays on the CPU. Forked processes may share it and "auto".
     - ``"pyrender"`` draws through OpenGL, in perspective, and needs a system with EGL. A process
       that is forked after its first use cannot use it: start processes by "spawn".
-
-    For ``many_views``, "auto" leaves out the back faces of closed surfaces, which halves the time.
 
     Raises :class:`RenderingError` where the backend does not work.
 
@@ -42,11 +41,7 @@ def make_renderer(
         from .opengl import PyrenderRenderer
 
         return PyrenderRenderer(mesh)
-    from .embree import EmbreeRenderer, RasterRenderer
-
-    return (
-        EmbreeRenderer(mesh) if backend == "embree" else RasterRenderer(mesh, many_views=many_views)
-    )
+    return EmbreeRenderer(mesh) if backend == "embree" else RasterRenderer(mesh)
 
 
 def render_depth(
@@ -84,10 +79,9 @@ def render_depth(
         >>> depth.shape, round(float(depth[0, 0, 32, 32]), 4)
         (torch.Size([1, 1, 64, 64]), 3.5)
     """
-    T = T_cam_from_model[None] if T_cam_from_model.ndim == 2 else T_cam_from_model
     backend = make_renderer(as_mesh(mesh), renderer)
     try:
-        return backend.render(T, camera_matrix, size, orthographic=orthographic)
+        return backend.render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
     except (InvalidInputError, RenderingError):
         raise
     except Exception as error:  # drivers raise anything

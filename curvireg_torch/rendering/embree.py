@@ -1,8 +1,8 @@
 """Depth on the CPU, by ray casting with embree and by OpenCV's z-buffer: no GPU, no driver, no
 display."""
 
-import itertools
 import math
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +14,6 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from torch import Tensor
 
-from ..mesh.edges import encloses_volumes
 from ..mesh.mesh import Mesh, box_corners, extreme_points, mesh_centre, mesh_radius
 from ..utils.threads import for_each
 from .renderer import NEAREST, check_render_arguments
@@ -25,9 +24,6 @@ _MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
 # Space, in object radii, between the object and the planes in front and behind it between which
 # OpenCV draws
 BESIDE = 1e-3
-MAX_CULLED_FACES = 10_000  # Checking larger meshes takes longer than it saves
-# Fraction of the object's pixels that may change where back faces are left out
-DIFFERENT_PIXELS = 1e-3
 # Depth, in object radii, beyond which single precision does not separate object and background
 FARTHEST = 1000.0
 
@@ -102,23 +98,37 @@ class EmbreeRenderer:
         *,
         orthographic: bool = False,
     ) -> Tensor:
-        T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
-        depth = np.zeros((len(T), *size), np.float32)
-        scene, outline = self._scene
+        scene, _ = self._scene
+        return self._cast(
+            T_cam_from_model,
+            camera_matrix,
+            size,
+            orthographic,
+            lambda _, *rays: scene.distance(*rays),
+        )
+
+    def _cast(
+        self,
+        T: Tensor,
+        K: Tensor,
+        size: tuple[int, int],
+        orthographic: bool,
+        hit: Callable[..., np.ndarray],
+    ) -> Tensor:
+        """(N, 1, H, W) depth; ``hit`` is called with the place of the pixels of a view that may
+        show the object, and their rays, and returns the distances to what these hit."""
+        poses, cameras = (x.numpy() for x in check_render_arguments(T, K, size))
+        depth = np.zeros((len(poses), *size), np.float32)
 
         def cast(i: int) -> None:
-            if rays := self._rays(outline, T[i], K[i], size, orthographic):
+            if rays := self._rays(poses[i], cameras[i], size, orthographic):
                 mask, starts, directions, near = rays
-                depth[i][mask] = self._depth(scene.distance(starts, directions), near)
+                along = hit((i, mask), starts, directions)
+                z = (along + np.float32(near)) * np.float32(self._radius)
+                depth[i, mask] = np.where(np.isinf(z), np.float32(0.0), z)
 
-        for_each(len(T), cast)
+        for_each(len(poses), cast)
         return torch.from_numpy(depth)[:, None]
-
-    def _depth(self, along: np.ndarray, near: float) -> np.ndarray:
-        """(M,) depth in model units of what rays hit at distances ``along`` (M,) from the plane
-        where they start, at ``near`` radii; 0 for inf."""
-        z = (along + np.float32(near)) * np.float32(self._radius)
-        return np.where(np.isinf(z), np.float32(0.0), z)
 
     def faces_at(
         self,
@@ -131,34 +141,26 @@ class EmbreeRenderer:
         """(N, H, W) int32 faces that pixels show, -1 for none; (N, H, W) float32 u and v of their
         points (1 - u - v) a + u b + v c, with the face's corners a, b, c; and (N, 1, H, W)
         depth."""
-        T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
-        face = np.full((len(T), *size), -1, dtype=np.int32)
-        u, v, depth = (np.zeros(face.shape, np.float32) for _ in range(3))
-        scene, outline = self._scene
+        face = np.full((len(T_cam_from_model), *size), -1, dtype=np.int32)
+        u, v = (np.zeros(face.shape, np.float32) for _ in range(2))
+        scene, _ = self._scene
 
-        def cast(i: int) -> None:
-            if rays := self._rays(outline, T[i], K[i], size, orthographic):
-                mask, starts, directions, near = rays
-                face[i][mask], u[i][mask], v[i][mask], along = scene.hits(starts, directions)
-                depth[i][mask] = self._depth(along, near)
+        def hit(place: Any, *rays: np.ndarray) -> np.ndarray:
+            face[place], u[place], v[place], along = scene.hits(*rays)
+            return along
 
-        for_each(len(T), cast)
-        return face, u, v, torch.from_numpy(depth)[:, None]
+        depth = self._cast(T_cam_from_model, camera_matrix, size, orthographic, hit)
+        return face, u, v, depth
 
     def _rays(
-        self,
-        outline: np.ndarray,
-        T: np.ndarray,
-        K: np.ndarray,
-        size: tuple[int, ...],
-        orthographic: bool,
+        self, T: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
         """Pixels (H, W) that may show the object, origins and directions of their rays, and their
         start depth."""
         R = T[:3, :3]
         # centre of the object in the camera, in radii
         t = (T[:3, 3] + R @ self._centre) / self._radius
-        outline = outline @ R.T + t
+        outline = self._scene[1] @ R.T + t
         nearest = outline[:, 2].min()
         if outline[:, 2].max() <= NEAREST:
             return None  # entirely behind the camera
@@ -215,38 +217,17 @@ class RasterRenderer(EmbreeRenderer):
     """Draws into OpenCV's z-buffer, views in parallel on threads; casts rays where OpenCV is slower
     or wrong. The time of the z-buffer grows with the faces, that of ray casting with the pixels: it
     is used for meshes of fewer faces than the image has pixels. It does not clip faces that cross
-    the near plane, is not precise far away, and knows no parallel projection. For ``many_views`` of
-    at most ``MAX_CULLED_FACES`` faces it leaves out back faces, which halves the time, if all
-    surfaces are closed, none is inside out, and pictures from eight sides are the same."""
+    the near plane, is not precise far away, and knows no parallel projection."""
 
     name = "auto"
 
-    def __init__(self, mesh: Mesh | trimesh.Trimesh, *, many_views: bool = False) -> None:
+    def __init__(self, mesh: Mesh | trimesh.Trimesh) -> None:
         super().__init__(mesh)
         self._corners = self._scaled(box_corners(mesh))
         self._vertices = float32(self._scaled(mesh.vertices))[:, None]
         self._faces = np.array(mesh.faces, np.int32)[:, None]
         self._settings = cv2.TriangleRasterizeSettings()
         self._settings.setCullingMode(cv2.RASTERIZE_CULLING_NONE)
-        self.draws_back_faces = True
-        if many_views and len(self._faces) <= MAX_CULLED_FACES and encloses_volumes(mesh):
-            before = self._from_corners()
-            self._settings.setCullingMode(cv2.RASTERIZE_CULLING_CW)
-            different = (self._from_corners() != before).sum()
-            self.draws_back_faces = bool(different > DIFFERENT_PIXELS * (before > 0).sum())
-            if self.draws_back_faces:
-                self._settings.setCullingMode(cv2.RASTERIZE_CULLING_NONE)
-
-    def _from_corners(self) -> np.ndarray:
-        """(8, 64, 64) depth from the corners of a cube around the object."""
-        K = np.array([[110.0, 0.0, 31.5], [0.0, 110.0, 31.5], [0.0, 0.0, 1.0]])
-        t = np.array([0.0, 0.0, 4.0])
-        pictures = []
-        for corner in itertools.product((-1.0, 1.0), repeat=3):
-            z = np.array(corner) / math.sqrt(3.0)
-            x = np.cross([0.0, 0.0, 1.0], z) * math.sqrt(1.5)
-            pictures.append(self._draw(np.stack([x, np.cross(z, x), z]), t, K, (64, 64), 2.9, 5.1))
-        return np.stack(pictures)
 
     def render(
         self,

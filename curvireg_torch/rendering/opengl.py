@@ -13,6 +13,7 @@ import trimesh
 from torch import Tensor
 
 from ..errors import InvalidInputError, RenderingError
+from ..geometry.cameras import point_in_cameras
 from ..geometry.conversions import opencv_from_opengl
 from ..mesh.mesh import Mesh, box_corners, mesh_centre, mesh_radius
 from .renderer import NEAREST, check_render_arguments
@@ -118,21 +119,16 @@ class PyrenderRenderer:
         import pyrender
 
         cam_from_model = T.clone()  # in radii, with the origin at the object's centre
-        cam_from_model[:3, 3] = (T[:3, 3] + T[:3, :3] @ self._centre) / self._radius
+        cam_from_model[:3, 3] = point_in_cameras(T, self._centre) / self._radius
         # A tight clip range spends all 24 bits of depth on the object.
         z = self._corners @ cam_from_model[2, :3] + cam_from_model[2, 3]
         near = max(float(z.min()) - 1e-3, NEAREST)
         far = float(z.max()) + 1e-3
         if far - 1e-3 <= near:
             return 0.0  # entirely behind the camera
+        (fx, _, cx), (_, fy, cy), _ = K.tolist()
         # pixel (0, 0) of OpenGL begins at 0
-        fx = K[0, 0]
-        fy = K[1, 1]
-        cx = K[0, 2] + 0.5
-        cy = K[1, 2] + 0.5
-        camera = pyrender.IntrinsicsCamera(
-            *(float(x) for x in (fx, fy, cx, cy)), znear=near, zfar=far
-        )
+        camera = pyrender.IntrinsicsCamera(fx, fy, cx + 0.5, cy + 0.5, znear=near, zfar=far)
         pose = torch.linalg.inv(opencv_from_opengl(cam_from_model)).numpy()
         node = self._scene.add(camera, pose=pose)
         try:

@@ -37,7 +37,9 @@ class DepthRenderer(Protocol):
 
 
 def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Rigid poses (N, 4, 4) and cameras (N, 3, 3), checked, as float64 on the CPU."""
+    """Rigid poses (N, 4, 4), or one (4, 4), and cameras (N, 3, 3), checked, as float64 on the
+    CPU."""
+    T = T[None] if T.ndim == 2 else T
     check_tensor(T, "T_cam_from_model", (None, 4, 4))
     if len(size) != 2 or min(size) < 1:
         raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")

@@ -47,8 +47,7 @@ def render_colour(
         True
     """
     mesh = as_mesh(mesh)
-    T = T_cam_from_model[None] if T_cam_from_model.ndim == 2 else T_cam_from_model
-    T, K = check_render_arguments(T, camera_matrix, size)
+    T, K = check_render_arguments(T_cam_from_model, camera_matrix, size)
     check_integer(supersampling, "supersampling")
     shift = 0.5 - 0.5 / supersampling
     zoom = torch.tensor([[1.0, 0, shift], [0, 1, shift], [0, 0, 1 / supersampling]])
@@ -64,9 +63,8 @@ def render_colour(
         face, u, v, depth = faces_at(T, K, fine, orthographic=orthographic)
         visible = face >= 0
         albedo[visible] = colours_at(colours, face[visible], u[visible], v[visible])
-    picture = shade(depth, K, orthographic=orthographic) * torch.from_numpy(albedo).permute(
-        0, 3, 1, 2
-    )
+    grey = shade(depth, K, orthographic=orthographic)
+    picture = grey * torch.from_numpy(albedo).movedim(3, 1)
     return F.avg_pool2d(picture.contiguous(), supersampling)
 
 

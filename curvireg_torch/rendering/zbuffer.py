@@ -1,12 +1,11 @@
 """Depth by a z-buffer on any device of torch, many views at a time."""
 
-from typing import NamedTuple
-
 import torch
 import trimesh
 from torch import Tensor
 
-from ..mesh.mesh import Mesh, mesh_centre, mesh_radius
+from ..geometry.cameras import point_in_cameras
+from ..mesh.mesh import Mesh
 from .embree import EmbreeRenderer
 from .renderer import NEAREST, check_render_arguments
 
@@ -17,9 +16,10 @@ FRAGMENTS_AT_A_TIME = 2**24
 BESIDE_TRIANGLE = 1e-5
 
 
-class DeviceRenderer:
+class DeviceRenderer(EmbreeRenderer):
     """Draws every triangle into the pixels of its box in the image, on one device. Views that the
-    object's near side or the camera plane cuts are drawn by ray casting on the CPU.
+    object's near side or the camera plane cuts, and parallel projections, are drawn by ray casting
+    on the CPU.
 
     Args:
         mesh: a clean mesh, see :func:`curvireg_torch.load_mesh`.
@@ -29,12 +29,9 @@ class DeviceRenderer:
     name = "torch"
 
     def __init__(self, mesh: Mesh | trimesh.Trimesh, device: torch.device | str) -> None:
-        self._mesh = mesh
+        super().__init__(mesh)
         self._device = torch.device(device)
-        self._radius = mesh_radius(mesh)
-        self._centre = mesh_centre(mesh)
-        vertices = (torch.tensor(mesh.vertices) - self._centre) / self._radius
-        self._vertices = vertices.to(self._device)
+        self._vertices = torch.from_numpy(self._scaled(mesh.vertices)).to(self._device)
         self._faces = torch.tensor(mesh.faces, dtype=torch.long).to(self._device)
 
     def render(
@@ -46,127 +43,85 @@ class DeviceRenderer:
         orthographic: bool = False,
     ) -> Tensor:
         """See :class:`.DepthRenderer`; the depth is on this device."""
+        if orthographic:
+            rays = super().render(T_cam_from_model, camera_matrix, size, orthographic=True)
+            return rays.to(self._device)
         T, K = check_render_arguments(T_cam_from_model, camera_matrix, size)
-        position = (T[:, :3, :3] @ self._centre + T[:, :3, 3]) / self._radius
+        position = point_in_cameras(T, torch.from_numpy(self._centre)) / self._radius
         R = T[:, :3, :3].to(self._device)
         points = self._vertices @ R.mT + position[:, None].to(self._device)
         z = points[..., 2]
-        pixels = _projected(points, K.to(self._device), self._radius, orthographic)
-        depth = self._radius * _drawn(pixels, z, self._faces, size, orthographic)
-        is_cut = (z.amin(dim=1) <= NEAREST) & (z.amax(dim=1) > NEAREST)
-        cut = is_cut.nonzero()[:, 0].cpu()
-        if len(cut):
-            rays = EmbreeRenderer(self._mesh)
-            part = rays.render(T[cut], K[cut], size, orthographic=orthographic)
-            depth[cut.to(self._device)] = part.to(self._device)
+        pixels = _projected(points, K.to(self._device))
+        depth = self._radius * _drawn(pixels, z, self._faces, size)
+        is_cut = ((z.amin(dim=1) <= NEAREST) & (z.amax(dim=1) > NEAREST)).cpu()
+        if is_cut.any():
+            rays = super().render(T[is_cut], K[is_cut], size)
+            depth[is_cut.to(self._device)] = rays.to(self._device)
         return depth
 
 
-def _projected(points: Tensor, K: Tensor, radius: float, orthographic: bool) -> Tensor:
-    """(N, V, 2) float64 pixels of points (N, V, 3) in radii in the cameras' frames."""
-    z = points[..., 2:].clamp(min=NEAREST)
-    xy = radius * points[..., :2] if orthographic else points[..., :2] / z
-    focal_lengths = torch.stack([K[:, 0, 0], K[:, 1, 1]], dim=1)
-    return xy * focal_lengths[:, None] + K[:, None, :2, 2]
+def _projected(points: Tensor, K: Tensor) -> Tensor:
+    """(N, V, 2) pixels of points (N, V, 3) in the cameras' frames."""
+    xy = points[..., :2] / points[..., 2:].clamp(min=NEAREST)
+    return xy * K.diagonal(dim1=1, dim2=2)[:, None, :2] + K[:, None, :2, 2]
 
 
-def _drawn(
-    pixels: Tensor, z: Tensor, faces: Tensor, size: tuple[int, int], orthographic: bool
-) -> Tensor:
+def _drawn(pixels: Tensor, z: Tensor, faces: Tensor, size: tuple[int, int]) -> Tensor:
     """(N, 1, H, W) float32 depth of N views with vertices at (N, V, 2) px and depths (N, V)."""
     H, W = size
-    N = len(pixels)
-    buffer = torch.zeros(N * H * W, dtype=torch.float32, device=pixels.device)
     corners = pixels[:, faces]  # (N, F, 3, 2)
     heights = z[:, faces]
     end = torch.tensor([W - 1, H - 1], dtype=pixels.dtype, device=pixels.device)
     # outside by a pixel at most, so that whole numbers hold them
-    first_pixel = corners.amin(dim=2).ceil()
-    last_pixel = corners.amax(dim=2).floor()
-    low = torch.minimum(first_pixel.clamp(min=0), end + 1).long()
-    high = torch.minimum(last_pixel, end).clamp(min=-1.0).long()
-    sides = (high - low + 1).clamp(min=0)
-    is_visible = (heights > NEAREST).all(dim=2)
-    count = sides.prod(dim=2) * is_visible
-    planes = _planes(corners, heights, orthographic)
-    for first, last in _groups(count.sum(dim=1).tolist(), FRAGMENTS_AT_A_TIME):
-        views = slice(first, last)
-        some = _Triangles(low[views], sides[views], count[views], planes[views])
-        _draw(buffer, first, some, size, orthographic)
-    nearest = buffer.view(N, 1, H, W)
-    drawn = nearest > 0
-    return torch.where(drawn, 1.0 / nearest.where(drawn, torch.ones_like(nearest)), 0.0)
+    first_pixel = torch.minimum(corners.amin(dim=2).ceil().clamp(min=0), end + 1)
+    last_pixel = torch.minimum(corners.amax(dim=2).floor(), end).clamp(min=-1.0)
+    is_visible = (heights > NEAREST).all(dim=2, keepdim=True)
+    sides = is_visible * (last_pixel - first_pixel + 1).clamp(min=0).long()
+    most = max(sides.prod(dim=2).sum(dim=1).tolist(), default=0)
+    at_a_time = max(1, FRAGMENTS_AT_A_TIME // max(1, most))
+    triangles = (first_pixel.long(), sides, _planes(corners, heights))
+    parts = zip(*(each.split(at_a_time) for each in triangles), strict=True)
+    inverse = torch.cat([_inverse_depth(a, b, c, size) for a, b, c in parts])
+    return torch.where(inverse > 0, 1.0 / inverse, 0.0)
 
 
-def _planes(corners: Tensor, z: Tensor, orthographic: bool) -> Tensor:
+def _planes(corners: Tensor, z: Tensor) -> Tensor:
     """(N, F, 9) float32 for the triangles with corners (N, F, 3, 2) px and depths (N, F, 3): its
     first corner (2), what multiplies the distance from it to give the second and the third
-    barycentric coordinate (2 x 2), and what is linear in them: the inverse depth, or the depth, at
-    the first corner, and by how much the others have more."""
+    barycentric coordinate (2 x 2), and the inverse depth, which is linear in them, at the first
+    corner, and by how much the others have more."""
     a, b, c = corners.unbind(dim=2)
-    u = b - a
-    v = c - a
-    ux, uy = u.unbind(-1)
-    vx, vy = v.unbind(-1)
+    ux, uy = (b - a).unbind(-1)
+    vx, vy = (c - a).unbind(-1)
     area = ux * vy - uy * vx
     scale = torch.where(area.abs() > 1e-9, 1.0 / area, torch.nan)  # no pixel: seen from the side
     second = torch.stack([scale * vy, -scale * vx], dim=-1)
     third = torch.stack([-scale * uy, scale * ux], dim=-1)
-    height = z if orthographic else 1.0 / z.clamp(min=NEAREST)
+    height = 1.0 / z.clamp(min=NEAREST)
     slopes = height[..., 1:] - height[..., :1]
     return torch.cat([a, second, third, height[..., :1], slopes], dim=-1).float()
 
 
-class _Triangles(NamedTuple):
-    """Triangles in N views: the first pixels of their boxes (N, F, 2), the boxes' sides (N, F, 2),
-    the numbers of their pixels (N, F), and :func:`_planes` (N, F, 9)."""
-
-    low: Tensor
-    sides: Tensor
-    number: Tensor
-    planes: Tensor
-
-
-def _draw(
-    buffer: Tensor, first: int, triangles: _Triangles, size: tuple[int, int], orthographic: bool
-) -> None:
-    """Draw some views, of which the ``first`` is given, into a buffer of inverse depth."""
+def _inverse_depth(low: Tensor, sides: Tensor, planes: Tensor, size: tuple[int, int]) -> Tensor:
+    """(N, 1, H, W) inverse depth, 0 for none, of triangles in N views: the first pixels of their
+    boxes (N, F, 2), the boxes' sides (N, F, 2) and :func:`_planes` (N, F, 9)."""
     H, W = size
-    n, F = triangles.number.shape
-    count = triangles.number.flatten()
-    triangle = torch.arange(n * F, device=count.device).repeat_interleave(count)
+    N, F, _ = sides.shape
+    count = sides.prod(dim=2).flatten()
+    triangle = torch.arange(N * F, device=count.device).repeat_interleave(count)
     start = count.cumsum(dim=0) - count
     place = torch.arange(len(triangle), device=count.device) - start[triangle]
-    width = triangles.sides[..., 0].flatten()[triangle]
-    left, top = triangles.low.flatten(0, 1)[triangle].unbind(1)
+    width = sides[..., 0].flatten()[triangle]
+    left, top = low.flatten(0, 1)[triangle].unbind(1)
     x = left + place % width
     y = top + place // width
-    plane = triangles.planes.flatten(0, 1)[triangle]
-    x0, y0, second_x, second_y, third_x, third_y, height, second_slope, third_slope = plane.unbind(
-        1
-    )
-    dx = x - x0
-    dy = y - y0
-    second = dx * second_x + dy * second_y
-    third = dx * third_x + dy * third_y
-    first_coordinate = 1.0 - second - third
-    least = torch.minimum(torch.minimum(second, third), first_coordinate)
-    value = height + second * second_slope + third * third_slope
-    inverse = 1.0 / value if orthographic else value
+    corner, across, down, heights = planes.flatten(0, 1)[triangle].split([2, 2, 2, 3], dim=1)
+    from_corner = torch.stack([x, y], dim=1) - corner
+    second = (from_corner * across).sum(dim=1)
+    third = (from_corner * down).sum(dim=1)
+    least = torch.minimum(torch.minimum(second, third), 1.0 - second - third)
+    inverse = heights[:, 0] + second * heights[:, 1] + third * heights[:, 2]
     inverse = torch.where(least >= -BESIDE_TRIANGLE, inverse, 0.0)
-    pixel = ((first + triangle // F) * H + y) * W + x
-    buffer.scatter_reduce_(0, pixel, inverse, "amax")
-
-
-def _groups(counts: list[int], most: int) -> list[tuple[int, int]]:
-    """Ranges of consecutive items, the sum of whose counts is at most ``most``, or single ones."""
-    groups = []
-    first = 0
-    total = 0
-    for k, count in enumerate(counts):
-        if k > first and total + count > most:
-            groups.append((first, k))
-            first = k
-            total = 0
-        total += count
-    return [*groups, (first, len(counts))] if counts else []
+    pixel = (triangle // F * H + y) * W + x
+    buffer = inverse.new_zeros(N * H * W)
+    return buffer.scatter_reduce_(0, pixel, inverse, "amax").view(N, 1, H, W)

@@ -1,8 +1,9 @@
 """The contours that were fitted, as anti-aliased lines with a dark rim, which show on any
 background."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from ..geometry.cameras import boxes_around, projected
 from ..geometry.crops import crop_transforms, square_boxes
 from ..matching import ViewDescriber
 from ..rendering.contours import LEVELS
-from .encoding import to_uint8
+from .encoding import rescaled, to_uint8
 
 OUTLINE = (0, 255, 80)
 CREASE = (255, 170, 0)
@@ -34,12 +35,14 @@ SHORT = 0.06
 
 @dataclass(frozen=True)
 class Drawn:
-    """A mesh that is drawn: its describer, ``T_cam_from_model`` (4, 4) with the camera matrix
-    (3, 3), and its box in px."""
+    """What is drawn of an object: a mesh, by its describer, at ``T_cam_from_model`` (4, 4) with the
+    camera matrix (3, 3), a box in px below it, and an arrow from the start to the end of ``axis``
+    (2, 3) in the model's frame; None: not drawn."""
 
     describer: ViewDescriber
     projection: tuple[Tensor, Tensor] | None
-    box: Sequence[float] | None
+    box: Sequence[float] | None = None
+    axis: Tensor | None = None
 
 
 def _line_width(size: Sequence[int]) -> float:
@@ -57,75 +60,63 @@ def close_up(size: Sequence[int], box: Sequence[float]) -> tuple[int, int, int, 
     return left, top, min(W, left + side), min(H, top + side)
 
 
-def longer_side(window: Sequence[float]) -> float:
-    """The longer side of a window or box x0, y0, x1, y1."""
+def draw_close_up(
+    image: Tensor, box: Sequence[float], side: float, objects: Sequence[Drawn]
+) -> np.ndarray:
+    """:func:`draw_window` around a box, at most ``side`` px wide and high."""
+    window = close_up(image.shape[-2:], box)
     x0, y0, x1, y1 = window
-    return max(x1 - x0, y1 - y0)
+    return draw_window(image, window, side / max(x1 - x0, y1 - y0), objects)
 
 
 def draw_window(
-    describer: ViewDescriber,
-    projection: tuple[Tensor, Tensor] | None,
-    image: Tensor,
-    window: Sequence[int],
-    scale: float,
-    box: Sequence[float] | None = None,
-    copies: Sequence[Drawn] = (),
-    axis: Tensor | None = None,
+    image: Tensor, window: Sequence[int], scale: float, objects: Sequence[Drawn]
 ) -> np.ndarray:
-    """(H', W', 3) uint8 RGB: part of a (1 or 3, H, W) photograph with a mesh's contours, and a box
-    in px below them.
+    """(H', W', 3) uint8 RGB: part of a (1 or 3, H, W) photograph with the contours of objects.
 
-    ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3); None draws no mesh.
     ``window`` is x0, y0, x1, y1 without the last column and row, and is resized by ``scale``.
-    ``copies`` are further meshes that are drawn. ``axis`` (2, 3) is the start and the end of an
-    arrow in the model's frame.
     """
     x0, y0, x1, y1 = window
-    picture = to_uint8(image[:, y0:y1, x0:x1])
-    if scale != 1.0:
-        size = max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale))
-        picture = np.asarray(
-            cv2.resize(
-                picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-            )
-        )
+    picture = rescaled(to_uint8(image[:, y0:y1, x0:x1]), scale)
     fx = picture.shape[1] / (x1 - x0)
     fy = picture.shape[0] / (y1 - y0)
     # of pixel centres
     moved = [[fx, 0.0, fx * (0.5 - x0) - 0.5], [0.0, fy, fy * (0.5 - y0) - 0.5], [0.0, 0.0, 1.0]]
     resize = torch.tensor(moved, dtype=torch.float64)
-    for drawn in (*copies, Drawn(describer, projection, box)):
-        if drawn.box is not None:
-            _draw_box(picture, resize, drawn.box)
-        if drawn.projection is not None:
-            T, K = drawn.projection
-            layer = contour_layer(drawn.describer, T, resize @ K.cpu().double(), picture.shape[:2])
-            _paint(picture, layer)
-    if axis is not None and projection is not None:
-        _draw_axis(picture, axis, projection[0], resize @ projection[1].cpu().double())
+    for each in objects:
+        if each.box is not None:
+            left, top, right, bottom = each.box
+            corners = torch.tensor([[left, right], [top, bottom], [1.0, 1.0]]).double()
+            thickness = _line_width(picture.shape[:2]) / 3
+            _draw_rimmed(cv2.rectangle, picture, (resize @ corners)[:2].mT, BOX, thickness)
+        if each.projection is not None:
+            T, K = (x.cpu().double() for x in each.projection)
+            _paint(picture, contour_layer(each.describer, T, resize @ K, picture.shape[:2]))
+            if each.axis is not None:
+                _draw_axis(picture, each.axis.to(T), T, resize @ K)
     return picture
 
 
 def _draw_axis(picture: np.ndarray, ends: Tensor, T: Tensor, K: Tensor) -> None:
     """Draw an arrow between ``ends`` (2, 3) of the model; ``K`` (3, 3) has px of the picture."""
-    depth = ends.to(T) @ T[2, :3] + T[2, 3]
-    if float(depth.min()) <= 0.0:
-        return
-    start, end = projected(ends.to(T), T, K.to(T)).round().int().tolist()
-    width = max(2, round(_line_width(picture.shape[:2])))
-    for colour, thickness in ((RIM, width + 2), (AXIS, width)):
-        cv2.arrowedLine(picture, start, end, colour, thickness, cv2.LINE_AA, tipLength=0.08)
+    if float((ends @ T[2, :3] + T[2, 3]).min()) > 0.0:
+        arrow = partial(cv2.arrowedLine, line_type=cv2.LINE_AA, tipLength=0.08)
+        thickness = max(2, _line_width(picture.shape[:2]))
+        _draw_rimmed(arrow, picture, projected(ends, T, K), AXIS, thickness)
 
 
-def _draw_box(picture: np.ndarray, resize: Tensor, box: Sequence[float]) -> None:
-    """Draw a box in px of the photograph, of which ``resize`` (3, 3) makes px of the picture."""
-    x0, y0, x1, y1 = box
-    corners = resize @ torch.tensor([[x0, x1], [y0, y1], [1.0, 1.0]], dtype=torch.float64)
-    start, end = corners[:2].mT.round().int().tolist()
-    width = max(1, round(_line_width(picture.shape[:2]) / 3))
-    for colour, thickness in ((RIM, width + 2), (BOX, width)):
-        cv2.rectangle(picture, start, end, colour, thickness)
+def _draw_rimmed(
+    draw: Callable[..., object],
+    picture: np.ndarray,
+    ends: Tensor,
+    colour: tuple[int, int, int],
+    thickness: float,
+) -> None:
+    """Draw what extends between two points (2, 2), with a dark rim."""
+    start, end = ends.round().int().tolist()
+    width = max(1, round(thickness))
+    draw(picture, start, end, RIM, width + 2)
+    draw(picture, start, end, colour, width)
 
 
 def _paint(picture: np.ndarray, layer: np.ndarray) -> None:

@@ -25,13 +25,18 @@ def embedded(content: bytes) -> str:
     return f"data:image/jpeg;base64,{base64.b64encode(content).decode()}"
 
 
+def rescaled(picture: np.ndarray, scale: float) -> np.ndarray:
+    """An (H, W, 3) uint8 picture, ``scale`` times as large."""
+    if scale == 1.0:
+        return picture
+    size = [max(1, round(side * scale)) for side in picture.shape[1::-1]]
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(picture, size, interpolation=how), np.uint8)
+
+
 def shrink(picture: np.ndarray, side: int) -> np.ndarray:
     """An (H, W, 3) uint8 picture, resized so that its longer side is at most ``side`` px."""
-    scale = side / max(picture.shape[:2])
-    if scale >= 1:
-        return picture
-    size = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return rescaled(picture, min(1.0, side / max(picture.shape[:2])))
 
 
 def to_uint8(image: Tensor) -> np.ndarray:

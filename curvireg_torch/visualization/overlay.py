@@ -20,7 +20,7 @@ from ..registration.photograph import Photograph, as_photograph
 from ..terms import crop_photographs, photograph_field
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, ImageLike
-from .contours import Drawn, close_up, draw_window, longer_side
+from .contours import Drawn, draw_close_up, draw_window
 from .encoding import to_uint8
 from .words import pose_in_words
 
@@ -75,15 +75,23 @@ def contour_overlay(
         (720, 960, 3)
     """
     item = _shown(image, box)
-    H, W = item.size
-    describer = registrar.of_mesh(getattr(result, "mesh_index", 0)).describer
-    more = drawn_copies(registrar, copies)
+    return _whole(registrar, result, item, copies, 1.0)
+
+
+def _whole(
+    registrar: Registrar,
+    result: Registration | Hypothesis,
+    item: Photograph,
+    copies: Sequence[Registration],
+    scale: float,
+) -> np.ndarray:
+    """The photograph, resized by ``scale``, with the object and its copies."""
+    target = registrar.of_mesh(getattr(result, "mesh_index", 0))
     axis = _axis_ends(registrar, result) if isinstance(result, Registration) else None
-    whole = (0, 0, W, H)
-    box_sides = item.box.tolist()
-    return draw_window(
-        describer, result.projection, item.image, whole, 1.0, box_sides, more, axis=axis
-    )
+    drawn = Drawn(target.describer, result.projection, item.box.tolist(), axis)
+    H, W = item.size
+    objects = [*drawn_copies(registrar, copies), drawn]
+    return draw_window(item.image, (0, 0, W, H), scale, objects)
 
 
 def _shown(image: ImageLike | Photograph, box: BoxLike | None) -> Photograph:
@@ -128,8 +136,8 @@ def views_sheet(
     tiles = []
     for projection, image, box, caption in views:
         H, W = image.shape[-2:]
-        picture = draw_window(describer, projection, image, (0, 0, W, H), side / max(H, W), box)
-        tiles.append((caption, picture))
+        drawn = Drawn(describer, projection, box)
+        tiles.append((caption, draw_window(image, (0, 0, W, H), side / max(H, W), [drawn])))
     height = max(picture.shape[0] for _, picture in tiles)
     sheet = Image.new("RGB", (MOST, -(-len(views) // columns) * (height + 32 + GAP)), PAPER)
     _paste_tiles(sheet, tiles, (0, 0), columns, (side, height), 16)
@@ -227,24 +235,12 @@ def registration_sheet(
         960
     """
     item = _shown(image, box)
-    more = drawn_copies(registrar, copies)
-    axis = _axis_ends(registrar, result)
-    if axis is not None:
+    if _axis_ends(registrar, result) is not None:
         note = f"Blue: the axis, which is certain; the turn about it is not. {note}"
-    registrar = registrar.of_mesh(result.mesh_index)
     H, W = item.size
     scale = min(max(LEAST, H, W), MOST) / max(H, W)
-    whole = (0, 0, W, H)
-    photograph = draw_window(
-        registrar.describer,
-        result.projection,
-        item.image,
-        whole,
-        scale,
-        item.box.tolist(),
-        more,
-        axis=axis,
-    )
+    photograph = _whole(registrar, result, item, copies, scale)
+    registrar = registrar.of_mesh(result.mesh_index)
     if copies:
         note = f"{1 + len(copies)} objects; words and small pictures: the best one. {note}"
     height = photograph.shape[0]
@@ -306,12 +302,9 @@ def _small_pictures(
     registrar: Registrar, result: Registration, item: Photograph, side: int
 ) -> list[tuple[str, np.ndarray]]:
     """Captions and pictures, at most ``side`` px wide and high."""
-    window = close_up(item.size, item.box.tolist())
-    scale = side / longer_side(window)
-    describer = registrar.describer
-    close_ups = [
-        draw_window(describer, h.projection, item.image, window, scale) for h in result.hypotheses
-    ]
+    box = item.box.tolist()
+    objects = [Drawn(registrar.describer, pose.projection) for pose in result.hypotheses]
+    close_ups = [draw_close_up(item.image, box, side, [each]) for each in objects]
     sides = side_pictures(registrar, result, item)
     names = "photograph field", "view field", "pose"
     captions = "edges of the photograph", "edges of the mesh", "mesh at this pose"

@@ -141,33 +141,27 @@ def _make_matt(tree: Fields) -> None:
 
 def _coloured(mesh: Mesh) -> trimesh.Trimesh:
     """The mesh with vertex colours; faces share no vertices, so that edges stay sharp."""
-    faces = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
+    faces = np.arange(mesh.faces.size).reshape(-1, 3)
     plain = trimesh.Trimesh(mesh.vertices[mesh.faces].reshape(-1, 3), faces, process=False)
     rgb = np.full(3, 190 / 255)
-    colours = mesh.colours
-    if colours is not None:
-        index = np.arange(len(faces), dtype=np.int32)
-        zero = np.zeros(len(faces), np.float32)
-        one = zero + 1
-        corners = (zero, zero), (one, zero), (zero, one)
-        rgb = np.stack([colours_at(colours, index, u, v) for u, v in corners], axis=1)
+    if mesh.colours is not None:
+        face = np.repeat(np.arange(len(faces), dtype=np.int32), 3)
+        corners = np.tile(np.eye(3, dtype=np.float32), (len(faces), 1))
+        rgb = colours_at(mesh.colours, face, corners[:, 1], corners[:, 2])
     # From sRGB: the vertex colours of glTF are linear.
     linear = linear_colours(rgb)
-    rgba = np.full((*faces.shape, 4), 255, np.uint8)
-    rgba[..., :3] = (linear * 255).round()
-    plain.visual = trimesh.visual.ColorVisuals(plain, vertex_colors=rgba.reshape(-1, 4))
+    rgba = np.full((faces.size, 4), 255, np.uint8)
+    rgba[:, :3] = (linear * 255).round()
+    plain.visual = trimesh.visual.ColorVisuals(plain, vertex_colors=rgba)
     return plain
 
 
 def _photograph_plane(image: Tensor, K: Tensor, depth: float) -> trimesh.Trimesh:
     """The photograph as a plane at a depth, in OpenCV's camera frame."""
     H, W = (int(n) for n in image.shape[-2:])
-    right = W - 0.5
-    bottom = H - 0.5
-    edges = [[-0.5, -0.5, 1.0], [right, -0.5, 1.0], [right, bottom, 1.0], [-0.5, bottom, 1.0]]
-    pixels = torch.tensor(edges, dtype=torch.float64)
-    corners = (depth * pixels @ torch.linalg.inv(K).T).numpy()
     uv = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
+    pixels = np.column_stack([W * uv[:, 0] - 0.5, H * (1.0 - uv[:, 1]) - 0.5, np.ones(4)])
+    corners = depth * pixels @ np.linalg.inv(K.numpy()).T
     faces = np.array([[0, 3, 2], [0, 2, 1]])  # counterclockwise after the flip
     # exporters write it as JPEG
     texture = Image.open(BytesIO(jpeg(shrink(to_uint8(image), _PHOTO_SIDE), 85)))

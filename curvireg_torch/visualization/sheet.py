@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..matching import ViewDescriber
 from ..utils.files import write_file
-from .contours import Drawn, close_up, draw_window, longer_side
+from .contours import Drawn, draw_close_up
 from .encoding import embedded, jpeg
 
 SIDE = 224  # longer side of a thumbnail in px
@@ -65,9 +65,8 @@ def thumbnail(
     """
     boxes = np.array([box, *(copy.box for copy in copies)])
     around = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]
-    window = close_up(image.shape[-2:], around)
-    scale = min(1.0, SIDE / longer_side(window))
-    return jpeg(draw_window(describer, projection, image, window, scale, box, copies), 80)
+    drawn = Drawn(describer, projection, box)
+    return jpeg(draw_close_up(image, around, SIDE, [*copies, drawn]), 80)
 
 
 def write_sheet(

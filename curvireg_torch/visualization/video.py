@@ -12,7 +12,7 @@ from torch import Tensor
 from ..errors import OutputError
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.confidence import two_decimals
-from .contours import draw_window
+from .contours import Drawn, draw_window
 from .overlay import VERDICT_COLOURS
 
 _LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
@@ -126,26 +126,19 @@ def annotated_frame(
     """(H, W, 3) uint8 of the image, of at most 960 px, with the mesh's contours if there is a pose,
     and a caption."""
     H, W = image.shape[-2:]
-    found = isinstance(result, Registration)
-    describer = registrar.of_mesh(result.mesh_index if found else 0).describer
     scale = min(1.0, _LONGER_SIDE / max(H, W))
-    picture = draw_window(
-        describer, result.projection if found else None, image, (0, 0, W, H), scale
-    )
+    objects = []
+    if isinstance(result, Registration):
+        describer = registrar.of_mesh(result.mesh_index).describer
+        objects = [Drawn(describer, result.projection)]
+    picture = draw_window(image, (0, 0, W, H), scale, objects)
     text, colour = caption(result)
     scale = max(0.4, picture.shape[1] / 1200)
     (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
     cv2.rectangle(picture, (0, 0), (width + 12, height + below + 6), colour, cv2.FILLED)
-    cv2.putText(
-        picture,
-        text,
-        (6, height + 4),
-        cv2.FONT_HERSHEY_SIMPLEX,
-        scale,
-        (255, 255, 255),
-        1,
-        cv2.LINE_AA,
-    )
+    corner = (6, height + 4)
+    white = (255, 255, 255)
+    cv2.putText(picture, text, corner, cv2.FONT_HERSHEY_SIMPLEX, scale, white, 1, cv2.LINE_AA)
     return picture
 
 

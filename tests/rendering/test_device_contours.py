@@ -6,9 +6,9 @@ from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.rendering.visibility import FaceTests
-from curvireg_torch.rendering.zbuffer import DeviceRenderer, _groups
+from curvireg_torch.rendering.zbuffer import DeviceRenderer
 from curvireg_torch.synthetic import example_mesh, random_pose
-from tests._support import double, seeded
+from tests._support import seeded
 
 MESHES = {
     "truck": example_mesh,
@@ -78,16 +78,11 @@ def test_contours_do_not_depend_on_the_batch(monkeypatch):
 
 
 @pytest.mark.parametrize("name", MESHES)
-@pytest.mark.parametrize("orthographic", [False, True])
-def test_depth_of_the_device_is_that_of_rays(name, orthographic):
+def test_depth_of_the_device_is_that_of_rays(name):
     mesh = MESHES[name]()
     T, K = poses_of(mesh, 96, 3)
-    if orthographic:
-        K = torch.diag(double([0.2, 0.2, 1.0])) @ K
-        K[:2, 2] *= 5.0
-    given = T, K, (90, 100)
-    expected = make_renderer(mesh, "embree").render(*given, orthographic=orthographic)
-    depth = DeviceRenderer(mesh, "cpu").render(*given, orthographic=orthographic)
+    expected = make_renderer(mesh, "embree").render(T, K, (90, 100))
+    depth = DeviceRenderer(mesh, "cpu").render(T, K, (90, 100))
     both = (depth > 0) & (expected > 0)
     assert both.sum() > 150
     assert ((depth > 0) != (expected > 0)).sum() <= 0.002 * int(both.sum())
@@ -105,6 +100,9 @@ def test_views_that_the_camera_plane_cuts_are_drawn_by_rays():
     assert (depth[1] > 0).any()
 
 
-def test_groups_of_views_have_few_fragments():
-    assert _groups([3, 4, 9, 1, 1], 8) == [(0, 2), (2, 3), (3, 5)]
-    assert _groups([], 8) == []
+def test_depth_does_not_depend_on_the_batch(monkeypatch):
+    T, K = poses_of(example_mesh(), 96, 3)
+    renderer = DeviceRenderer(example_mesh(), "cpu")
+    together = renderer.render(T, K, (90, 100))
+    monkeypatch.setattr("curvireg_torch.rendering.zbuffer.FRAGMENTS_AT_A_TIME", 1)
+    assert torch.equal(renderer.render(T, K, (90, 100)), together)
