@@ -2,10 +2,8 @@
 
 import json
 import re
-import struct
 import tomllib
 import zipfile
-import zlib
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ import yaml
 from ..errors import InvalidInputError
 from ..utils.aliases import Fields
 from ..utils.files import foreign_content
+from .xml_files import read_xml
 
 EXPECTED = (
     "YAML, XML or JSON of OpenCV, camera_info of ROS, camchain of Kalibr, cameras.txt of COLMAP, "
@@ -57,16 +56,18 @@ def read_document(file: Path, expected: str = EXPECTED) -> Any:
             "a binary file of COLMAP; write it as text: colmap model_converter --output_type TXT"
         )
     text = _text(data, expected)
+    start = text.lstrip()[:1]
     if numbers := _numbers_alone(text):
         return {"K": numbers}
     try:
         if _TOML.match(text):
             return _toml(text, expected)
-        if text.lstrip().startswith(("{", "[")) and file.suffix.lower() not in (".yaml", ".yml"):
+        if start and start in "{[" and file.suffix.lower() not in (".yaml", ".yml"):
             return json.loads(text)
-        if text.lstrip().startswith("<"):
-            return _xml(text)
-    except (ValueError, RecursionError, ElementTree.ParseError) as error:
+        if start == "<":
+            root = read_xml(data)
+            return {root.tag: _element(root)}
+    except (ValueError, RecursionError) as error:
         raise InvalidInputError(f"damaged, or no calibration ({error}); write it again") from error
     return _colmap(text) if _COLMAP_LINE.search(text) else _yaml(text, expected)
 
@@ -113,39 +114,24 @@ def _arrays(data: bytes) -> Fields:
         with zipfile.ZipFile(BytesIO(data)) as archive:
             members = archive.infolist()[:MAX_ARRAYS]
             small = [member for member in members if member.file_size <= MAX_ARRAY_BYTES]
-            arrays = [member for member in small if member.filename.endswith(".npy")]
             return {
                 member.filename.removesuffix(".npy"): _array(archive.read(member))
-                for member in arrays
+                for member in small
+                if member.filename.endswith(".npy")
             }
-    except InvalidInputError:
-        raise
-    except (
-        ValueError,
-        OSError,
-        EOFError,
-        MemoryError,
-        KeyError,
-        RuntimeError,  # encrypted, or packed otherwise
-        struct.error,
-        zlib.error,
-        zipfile.BadZipFile,
-    ) as error:
+    except Exception as error:  # both libraries raise errors of any kind for damaged files
         raise InvalidInputError("a damaged .npz or .npy; save it again with numpy.savez") from error
 
 
 def _array(data: bytes) -> Any:
-    """The values of a file of ``numpy.save``, whose header is checked before memory is taken; None
-    of objects."""
-    stream = BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    headers = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
-    shape, _, dtype = headers[version != (1, 0)](stream)
-    if dtype.kind not in "fiu":
-        return None
-    if int(np.prod(shape, dtype=object)) * dtype.itemsize > MAX_ARRAY_BYTES:
-        raise InvalidInputError("an array larger than its file; save it again")
-    return np.load(BytesIO(data), allow_pickle=False).astype(np.float64).tolist()
+    """The values of a file of ``numpy.save``; None of objects, which are not loaded, and texts."""
+    try:
+        array = np.load(BytesIO(data), allow_pickle=False)
+    except ValueError as error:
+        if "allow_pickle" in str(error):
+            return None
+        raise
+    return array.astype(np.float64).tolist() if array.dtype.kind in "fiu" else None
 
 
 def _colmap(text: str) -> Fields:
@@ -164,28 +150,19 @@ def _toml(text: str, expected: str) -> Any:
         raise InvalidInputError(f"neither TOML nor {expected}; write it again") from error
 
 
-def _xml(text: str) -> Any:
-    """Elements by their tags; attributes count as elements."""
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InvalidInputError(
-            "defines entities, which are not read; write it with cv2.FileStorage"
-        )
-
-    def value(element: ElementTree.Element) -> Any:
-        if not len(element) and (words := (element.text or "").split()):
-            numbers = [number(word) for word in words]
-            return numbers[0] if len(numbers) == 1 else numbers
-        values: Fields = {name: number(text) for name, text in element.attrib.items()}
-        for child in element:
-            inside = value(child)
-            several = values.get(child.tag)
-            if several:
-                inside = [*(several if isinstance(several, list) else [several]), inside]
-            values[child.tag] = inside
-        return values or []
-
-    root = ElementTree.fromstring(text)
-    return {root.tag: value(root)}
+def _element(element: ElementTree.Element) -> Any:
+    """The numbers or words of an element, or elements by their tags; attributes count as
+    elements."""
+    if not len(element) and (words := (element.text or "").split()):
+        numbers = [number(word) for word in words]
+        return numbers[0] if len(numbers) == 1 else numbers
+    values: Fields = {name: number(text) for name, text in element.attrib.items()}
+    for child in element:
+        inside = _element(child)
+        if several := values.get(child.tag):
+            inside = [*(several if isinstance(several, list) else [several]), inside]
+        values[child.tag] = inside
+    return values or []
 
 
 def _yaml(text: str, expected: str) -> Any:

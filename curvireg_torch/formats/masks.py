@@ -67,7 +67,7 @@ def read_mask(mask: PathName) -> Singles:
     """
     file, label = existing_mask(mask)
     (values, largest), orientation = decoded(file, _values)
-    values = oriented(values, orientation)[..., 0]
+    values = oriented(values, orientation)
     if label is not None:
         return _labelled(values, label, file)
     try:
@@ -85,7 +85,7 @@ def mask_as_shown(mask: Any, picture: PictureSize) -> Any:
     values = read_mask(mask) if isinstance(mask, str | os.PathLike) else np.asarray(mask)
     if values.shape != picture.stored:
         return values
-    return np.array(oriented(values[..., None], picture.orientation)[..., 0])
+    return np.array(oriented(values, picture.orientation))
 
 
 def mask_of_values(values: Array, largest: int) -> Singles:
@@ -116,9 +116,9 @@ def _labelled(values: Array, label: int, file: Path) -> Singles:
 
 
 def _values(image: "Image", orientation: int, _: bytes) -> tuple[Array, int]:
-    """(H, W, 1) values of an open picture, as they are stored, and the value of white."""
+    """(H, W) values of an open picture, as they are stored, and the value of white."""
     values, largest = _grey(image)
-    return as_in_file(values[..., None], image, orientation), largest
+    return as_in_file(values, image, orientation), largest
 
 
 def _grey(image: "Image") -> tuple[Array, int]:

@@ -96,8 +96,8 @@ def decoded(path: Path, read: Callable[["Image", int, bytes], T]) -> tuple[T, in
 
 
 def as_in_file(pixels: Array, image: "Image", orientation: int) -> Array:
-    """(H, W, C) decoded pixels as they are stored: Pillow applies the orientation of a TIFF, which
-    is taken back."""
+    """Decoded pixels (H, W) or (H, W, C) as they are stored: Pillow applies the orientation of a
+    TIFF, which is taken back."""
     return (
         oriented(pixels, {6: 8, 8: 6}.get(orientation, orientation))
         if image.format == "TIFF"
@@ -106,7 +106,7 @@ def as_in_file(pixels: Array, image: "Image", orientation: int) -> Array:
 
 
 def oriented(x: Array, orientation: int) -> Array:
-    """Stored (H, W, C) pixels as viewers show them, for an EXIF orientation."""
+    """Stored pixels (H, W) or (H, W, C) as viewers show them, for an EXIF orientation."""
     x = x[:: -1 if orientation in (3, 4, 6, 7) else 1, :: -1 if orientation in (2, 3, 7, 8) else 1]
     return x.swapaxes(0, 1) if orientation > 4 else x
 

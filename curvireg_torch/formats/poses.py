@@ -10,11 +10,10 @@ import numpy as np
 from trimesh.transformations import quaternion_matrix
 
 from ..errors import InvalidInputError, MissingFileError
-from ..utils.aliases import Document
 from ..utils.arrays import Floats
 from ..utils.choices import listed
 from ..utils.files import check_table_size, finite_numbers, split_name
-from .cameras.record import flattened, plain
+from .cameras.record import Record, flattened
 from .documents import read_document
 
 _README = "docs/guides/known-pose.md"
@@ -22,7 +21,6 @@ _MATRIX_NAMES = """
     T_cam_from_model T_cam_from_object cam_from_model T_cam_obj T_co T pose matrix transform
     transform_matrix ob_in_cam K
 """
-_MATRICES = set(map(plain, _MATRIX_NAMES.split()))
 # frames of ROS in which no camera looks along z: the world's, and bodies, whose x points forward
 _OTHER_FRAMES = re.compile(r"(^|/)(world|map|odom|base\w*|earth|\w*_link)$")
 FORMATS = (
@@ -86,14 +84,15 @@ def _pose_of(content: Any, name: str, mesh: str) -> PoseRecord:
     content = _named(content, name, mesh)
     if not isinstance(content, dict):
         raise InvalidInputError(f"expected {FORMATS}")
-    keys = {plain(key): key for key in content}
-    reader = next((read for key, read in _READERS.items() if key in keys), None)
-    if reader is not None:
-        return reader(content)
-    matrices = [flattened(content[key]) for name, key in keys.items() if name in _MATRICES]
-    if numbers := next((values for values in matrices if len(values) in (12, 16)), None):
-        return PoseRecord(_pose_matrix(numbers), None, _confidence(content))
-    return _rotation_and_translation(content)
+    record = Record(content, set())
+    for key, read in _READERS.items():
+        if record.has(key):
+            return read(record)
+    for name in _MATRIX_NAMES.split():
+        numbers = flattened(record.get(name))
+        if len(numbers) in (12, 16):
+            return PoseRecord(_pose_matrix(numbers), None, _confidence(record))
+    return _rotation_and_translation(record)
 
 
 def _named(content: Any, name: str, mesh: str) -> Any:
@@ -155,7 +154,7 @@ def _pose_matrix(numbers: Sequence[Any]) -> Floats:
 
 def _numbers(values: Any, name: str, count: int) -> Floats:
     """``count`` finite numbers of nested lists."""
-    numbers = finite_numbers(flattened(values) if isinstance(values, list) else values, count)
+    numbers = finite_numbers(flattened(values), count)
     if numbers is None:
         raise InvalidInputError(f"{name}: expected {count} finite numbers, got {values!r:.80}")
     return np.array(numbers)
@@ -168,66 +167,65 @@ def _transform(R: Floats, t: Floats) -> Floats:
     return T
 
 
-def _rotation_and_translation(content: Document) -> PoseRecord:
-    if content.get("frame") == "world":
+def _rotation_and_translation(record: Record) -> PoseRecord:
+    if record.get("frame") == "world":
         raise InvalidInputError(
             "a result of several photographs, whose pose is in the world; give that in one "
             "camera, as in 'photographs'"
         )
-    if "rotation" in content and content.get("translation", ...) is None:
+    rotation = record.get("rotation", "R")
+    translation = record.get("translation", "t")
+    if translation is None and record.has("rotation") and record.has("translation"):
         raise InvalidInputError(
             "a result without a translation, as of a photograph without a camera; register with "
             "a camera first"
         )
-    rotation = content.get("rotation", content.get("R"))
-    translation = content.get("translation", content.get("t"))
     if rotation is None or translation is None:
         missing = "rotation of 3 x 3 numbers" if rotation is None else "translation"
         raise InvalidInputError(f"no {missing}; expected {FORMATS}")
     R = _numbers(rotation, "rotation", 9)
     t = _numbers(translation, "translation", 3)
-    return PoseRecord(_transform(R, t), None, _confidence(content))
+    return PoseRecord(_transform(R, t), None, _confidence(record))
 
 
-def _confidence(content: Document) -> float | None:
-    numbers = finite_numbers([content.get("confidence")], 1)
+def _confidence(record: Record) -> float | None:
+    numbers = finite_numbers([record.get("confidence")], 1)
     return numbers[0] if numbers else None
 
 
-def _bop(content: Document) -> PoseRecord:
+def _bop(record: Record) -> PoseRecord:
     """An entry of scene_gt.json: millimetres."""
-    R = _numbers(content.get("cam_R_m2c"), "cam_R_m2c", 9)
-    t = _numbers(content.get("cam_t_m2c"), "cam_t_m2c", 3)
+    R = _numbers(record.get("cam_R_m2c"), "cam_R_m2c", 9)
+    t = _numbers(record.get("cam_t_m2c"), "cam_t_m2c", 3)
     return PoseRecord(_transform(R, t), "mm")
 
 
-def _megapose(content: Document) -> PoseRecord:
+def _megapose(record: Record) -> PoseRecord:
     """An entry of object_data.json: a quaternion x, y, z, w and metres, in the camera, which is the
     world."""
-    numbers = _numbers(flattened(content.get("TWO")), "TWO", 7)
-    if "TWC" in content:
+    numbers = _numbers(record.get("TWO"), "TWO", 7)
+    if record.has("TWC"):
         raise InvalidInputError(
             "TWO: in the world of TWC; give the pose in the camera, TWC^-1 TWO, without TWC"
         )
     return PoseRecord(_transform(_rotation(numbers[:4], "TWO"), numbers[4:]), "m")
 
 
-def _ros(content: Document) -> PoseRecord:
+def _ros(record: Record) -> PoseRecord:
     """A PoseStamped, as ``--format ros`` writes it: metres, in the camera's optical frame."""
-    header = content.get("header")
-    frame = str(header.get("frame_id") or "") if isinstance(header, dict) else ""
+    header = record.inside("header")
+    frame = str((header and header.get("frame_id")) or "")
     if _OTHER_FRAMES.search(frame):
         raise InvalidInputError(
             f"frame_id {frame!r:.60} is not the camera's optical frame (x right, y down, z "
             f"forward); transform the pose into that, as tf2 does"
         )
-    pose = content.get("pose")
-    while isinstance(pose, dict) and "pose" in pose:  # with a covariance beside it
-        pose = pose["pose"]
-    place, turn = (
-        pose.get(name) if isinstance(pose, dict) else None for name in ("position", "orientation")
-    )
-    if not isinstance(place, dict) or not isinstance(turn, dict):
+    pose = record.inside("pose")
+    while pose is not None and pose.has("pose"):  # with a covariance beside it
+        pose = pose.inside("pose")
+    place = pose and pose.inside("position")
+    turn = pose and pose.inside("orientation")
+    if place is None or turn is None:
         raise InvalidInputError(
             "pose: expected position and orientation; or a matrix of 4 x 4 numbers"
         )
@@ -246,9 +244,9 @@ def _rotation(quaternion: Floats, name: str) -> Floats:
     return np.asarray(quaternion_matrix(np.roll(quaternion, 1))[:3, :3])
 
 
-_READERS: dict[str, Callable[[Document], PoseRecord]] = {
-    "camrm2c": _bop,
-    "two": _megapose,
+_READERS: dict[str, Callable[[Record], PoseRecord]] = {
+    "cam_R_m2c": _bop,
+    "TWO": _megapose,
     "header": _ros,
 }
-"""Formats by a key, without case and punctuation, that only they have."""
+"""Formats by a key that only they have."""

@@ -12,6 +12,7 @@ from curvireg_torch.errors import ImageError, MissingDependencyError
 from curvireg_torch.formats import heif
 from curvireg_torch.formats.heif import heif_kind, open_photograph
 from tests._support.exif import exif
+from tests._support.refusals import raises
 
 
 @pytest.fixture
@@ -64,11 +65,9 @@ def test_heic_is_bounded_by_its_header(written, monkeypatch):
     monkeypatch.setattr("curvireg_torch.utils.pictures.MAX_IMAGE_PIXELS", 48 * 64)
     read_photo(file)
     monkeypatch.setattr("curvireg_torch.utils.pictures.MAX_IMAGE_PIXELS", 48 * 64 - 1)
-    with pytest.raises(ImageError, match="pixels; scale it down"):
-        open_photograph(file.read_bytes())
+    raises(ImageError, "pixels; scale it down", open_photograph, file.read_bytes())
     monkeypatch.setattr(heif, "MAX_IMAGE_BYTES", 10)
-    with pytest.raises(ImageError, match="larger than 10 bytes"):
-        open_photograph(file.read_bytes())
+    raises(ImageError, "larger than 10 bytes", open_photograph, file.read_bytes())
 
 
 def test_damaged_heic_is_refused_in_one_line(written, tmp_path):
@@ -83,14 +82,17 @@ def test_damaged_heic_is_refused_in_one_line(written, tmp_path):
 def test_a_missing_decoder_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + b"\0" * 99)
     monkeypatch.setitem(sys.modules, "pi_heif", None)
-    with pytest.raises(
-        MissingDependencyError, match=r"a\.heic: HEIC needs pi-heif: pip install .*heic"
-    ):
-        read_photo(tmp_path / "a.heic")
+    raises(
+        MissingDependencyError,
+        r"a\.heic: HEIC needs pi-heif: pip install .*heic",
+        read_photo,
+        tmp_path / "a.heic",
+    )
     monkeypatch.setattr(features, "check", lambda _: False)
     (tmp_path / "a.avif").write_bytes(b"\0\0\0\x18ftypavif\0\0\0\0mif1miaf" + b"\0" * 99)
-    with pytest.raises(MissingDependencyError, match=r"a\.avif: AVIF needs Pillow 11\.3"):
-        read_photo(tmp_path / "a.avif")
+    raises(
+        MissingDependencyError, r"a\.avif: AVIF needs Pillow 11\.3", read_photo, tmp_path / "a.avif"
+    )
 
 
 def test_kinds_are_told_by_the_brands_of_the_first_box():

@@ -14,6 +14,7 @@ from curvireg_torch.formats.masks import mask_as_shown, mask_file, read_mask
 from curvireg_torch.formats.pictures import picture_size
 from curvireg_torch.registration.photograph import as_photograph
 from tests._support.exif import exif, with_exif
+from tests._support.refusals import raises
 
 OBJECT = np.zeros((20, 30), bool)
 OBJECT[4:14, 6:24] = True
@@ -43,20 +44,19 @@ def test_labels_are_chosen_by_their_number(tmp_path):
     file = written(tmp_path / "labels.png", labels)
     assert np.array_equal(read_mask(f"{file}:2"), OBJECT.astype(np.float32))
     assert np.array_equal(read_mask(f"{file}:5"), (labels == 5).astype(np.float32))
-    with pytest.raises(
-        InvalidInputError, match="no white pixel, but labels 2, 5; choose one as FILE:LABEL"
-    ):
-        read_mask(file)
-    with pytest.raises(InvalidInputError, match="no pixel has the label 3; it has 0, 2, 5"):
-        read_mask(f"{file}:3")
+    raises(
+        InvalidInputError,
+        "no white pixel, but labels 2, 5; choose one as FILE:LABEL",
+        read_mask,
+        file,
+    )
+    raises(InvalidInputError, "no pixel has the label 3; it has 0, 2, 5", read_mask, f"{file}:3")
     bright = written(tmp_path / "bright.png", np.where(labels == 2, 200, labels).astype(np.uint8))
     assert np.array_equal(read_mask(f"{bright}:200") > 0, OBJECT)
     deep = written(tmp_path / "deep.png", (300 * labels.astype(np.uint16)))
     assert np.array_equal(read_mask(f"{deep}:600") > 0, OBJECT)
-    with pytest.raises(MissingFileError, match=r"lost\.png:2: no such file"):
-        read_mask(tmp_path / "lost.png:2")
-    with pytest.raises(InvalidInputError, match="a folder; give the file of one mask"):
-        read_mask(tmp_path)
+    raises(MissingFileError, r"lost\.png:2: no such file", read_mask, tmp_path / "lost.png:2")
+    raises(InvalidInputError, "a folder; give the file of one mask", read_mask, tmp_path)
     assert mask_file("a:b") == mask_file(mask_file("a:b")[0])
 
 
@@ -99,10 +99,14 @@ def test_masks_are_turned_as_their_photographs(tmp_path, suffix):
 def test_arrays_of_labels_are_read_as_files_are():
     item = as_photograph(torch.rand(3, 20, 30), None, mask=2 * OBJECT.astype(np.uint8))
     assert torch.equal(item.mask, torch.from_numpy(OBJECT).float())
-    with pytest.raises(InvalidInputError, match=r"labels 2, 5; .* mask == LABEL"):
-        as_photograph(
-            torch.rand(3, 20, 30), None, mask=torch.from_numpy(2 + 3 * OBJECT.astype(np.uint8))
-        )
+    raises(
+        InvalidInputError,
+        r"labels 2, 5; .* mask == LABEL",
+        as_photograph,
+        torch.rand(3, 20, 30),
+        None,
+        mask=torch.from_numpy(2 + 3 * OBJECT.astype(np.uint8)),
+    )
 
 
 def test_soft_borders_of_a_white_object_are_kept(tmp_path):

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch.data.poses import read_pose
 from curvireg_torch.errors import InvalidInputError, MissingFileError
+from tests._support.refusals import raises
 
 R = Rotation.from_euler("xyz", [20, -30, 50], degrees=True).as_matrix()
 t = np.array([0.02, -0.01, 0.6])
@@ -70,14 +71,24 @@ def test_megapose_writes_quaternions_and_metres(tmp_path):
     check(read_pose(tmp_path / "pose.json:can"), "m")
     check(read_pose(tmp_path / "pose.json:1"), "m")
     check(read_pose(file, mesh="can"), "m")
-    with pytest.raises(
-        InvalidInputError, match="expected one pose, got 2 of 2; choose one as FILE:NAME: box, can"
-    ):
-        read_pose(file)
-    with pytest.raises(InvalidInputError, match=r"in the world of TWC"):
-        read_pose(written(tmp_path, [{**mine, "TWC": [[0, 0, 0, 1], [0, 0, 1]]}]))
-    with pytest.raises(InvalidInputError, match="a quaternion x, y, z, w of length 1, got 2"):
-        read_pose(written(tmp_path, [{"TWO": [[0, 0, 0, 2], [0, 0, 1]]}]))
+    raises(
+        InvalidInputError,
+        "expected one pose, got 2 of 2; choose one as FILE:NAME: box, can",
+        read_pose,
+        file,
+    )
+    raises(
+        InvalidInputError,
+        r"in the world of TWC",
+        read_pose,
+        written(tmp_path, [{**mine, "TWC": [[0, 0, 0, 1], [0, 0, 1]]}]),
+    )
+    raises(
+        InvalidInputError,
+        "a quaternion x, y, z, w of length 1, got 2",
+        read_pose,
+        written(tmp_path, [{"TWO": [[0, 0, 0, 2], [0, 0, 1]]}]),
+    )
 
 
 def test_bop_writes_millimetres_and_several_objects(tmp_path):
@@ -88,12 +99,19 @@ def test_bop_writes_millimetres_and_several_objects(tmp_path):
     file = written(tmp_path, truth)
     check(read_pose(tmp_path / "pose.json:000003", mesh="obj_000005"), "mm")
     check(read_pose(tmp_path / "pose.json:12:1"), "mm")
-    with pytest.raises(
-        InvalidInputError, match="poses of several images; choose one as FILE:IMAGE_ID from 3, 12"
-    ):
-        read_pose(file)
-    with pytest.raises(InvalidInputError, match="expected one pose, got 2 of 2"):
-        read_pose(tmp_path / "pose.json:12", mesh="obj_000005")
+    raises(
+        InvalidInputError,
+        "poses of several images; choose one as FILE:IMAGE_ID from 3, 12",
+        read_pose,
+        file,
+    )
+    raises(
+        InvalidInputError,
+        "expected one pose, got 2 of 2",
+        read_pose,
+        tmp_path / "pose.json:12",
+        mesh="obj_000005",
+    )
     check(read_pose(written(tmp_path, {"7": [entry(1, R)]})), "mm")
     check(read_pose(written(tmp_path, entry(1, R))), "mm")
 
@@ -108,8 +126,12 @@ def test_ros_writes_metres(tmp_path):
         ),
         "m",
     )
-    with pytest.raises(InvalidInputError, match="expected position and orientation"):
-        read_pose(written(tmp_path, {"header": {}, "pose": [1]}))
+    raises(
+        InvalidInputError,
+        "expected position and orientation",
+        read_pose,
+        written(tmp_path, {"header": {}, "pose": [1]}),
+    )
 
 
 def test_opengl_poses_look_along_minus_z(tmp_path):
@@ -135,10 +157,13 @@ def test_what_is_no_pose_is_refused(tmp_path):
         ([], "expected JSON with rotation and translation, or T_cam_from_model"),
         ("text", "expected JSON with rotation"),
     ):
-        with pytest.raises(InvalidInputError, match=re.escape("pose.json: ") + ".*" + words):
-            read_pose(written(tmp_path, content))
-    with pytest.raises(MissingFileError, match=r"lost\.json:3: no such file"):
-        read_pose(tmp_path / "lost.json:3")
+        raises(
+            InvalidInputError,
+            re.escape("pose.json: ") + ".*" + words,
+            read_pose,
+            written(tmp_path, content),
+        )
+    raises(MissingFileError, r"lost\.json:3: no such file", read_pose, tmp_path / "lost.json:3")
 
 
 @pytest.mark.parametrize(
@@ -156,5 +181,4 @@ def test_results_of_both_schemas_are_start_poses(tmp_path, keys):
 
 def test_poses_in_the_world_are_no_start_poses(tmp_path):
     pose = {"rotation": R.tolist(), "translation": t.tolist(), "frame": "world"}
-    with pytest.raises(InvalidInputError, match="as in 'photographs'"):
-        read_pose(written(tmp_path, pose))
+    raises(InvalidInputError, "as in 'photographs'", read_pose, written(tmp_path, pose))

@@ -12,6 +12,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.formats.exports.ros import FILES, ros_covariance, time_stamp, write_ros
 from curvireg_torch.geometry import rotation_from_axis_angle
 from tests._support.numbers import double, seeded
+from tests._support.refusals import raises
 
 DOCUMENT = {
     "translation": [1000.0, -2000.0, 500.0],
@@ -83,8 +84,7 @@ def test_units_scale_positions_and_their_correlations():
 @pytest.mark.parametrize("text", ["-1", "now", "1e9", "3000000000", ""])
 def test_stamps_are_seconds(text):
     assert time_stamp("1700000000.123456789") == (1700000000, 123456789)
-    with pytest.raises(argparse.ArgumentTypeError, match="seconds since 1970"):
-        time_stamp(text)
+    raises(argparse.ArgumentTypeError, "seconds since 1970", time_stamp, text)
 
 
 @pytest.mark.parametrize(
@@ -104,11 +104,14 @@ def test_a_start_in_another_frame_than_the_optical_one_is_refused(tmp_path, fram
     if is_optical:
         assert read_pose(tmp_path / "pose.yaml").T[:3, 3].tolist() == [1.0, -2.0, 0.5]
         return
-    with pytest.raises(InvalidInputError, match=f"frame_id '{frame}' is not the camera's optical"):
-        read_pose(tmp_path / "pose.yaml")
+    raises(
+        InvalidInputError,
+        f"frame_id '{frame}' is not the camera's optical",
+        read_pose,
+        tmp_path / "pose.yaml",
+    )
 
 
 def test_a_start_of_our_own_rigs_is_in_the_world(tmp_path):
     write_ros(tmp_path, {**DOCUMENT, "frame": "world"})
-    with pytest.raises(InvalidInputError, match="frame_id 'world' is not"):
-        read_pose(tmp_path / "pose.yaml")
+    raises(InvalidInputError, "frame_id 'world' is not", read_pose, tmp_path / "pose.yaml")

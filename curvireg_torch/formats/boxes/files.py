@@ -164,8 +164,12 @@ def _labelme(content: Document) -> Iterator[ImageBox]:
             x, y, *edge = numbers[:4]
             radius = math.dist((x, y), edge)
             corners = (x - radius, y - radius, x + radius, y + radius)
-        label = frozenset({str(shape.get("label", ""))} - {""})
-        yield ImageBox(corners, image=image, size=size, labels=label)
+        labels = _labels(shape.get("label", ""))
+        yield ImageBox(corners, image=image, size=size, labels=labels)
+
+
+def _labels(*names: object) -> frozenset[str]:
+    return frozenset(map(str, names)) - {""}
 
 
 def _numbers_of_points(points: Any) -> Sequence[float]:
@@ -193,8 +197,8 @@ def _coco(content: Document) -> Iterator[ImageBox]:
             corners = (x + PIXEL_CENTRE, y + PIXEL_CENTRE, c + PIXEL_CENTRE, d + PIXEL_CENTRE)
         score = finite_numbers([fields.get("score", 1.0)], 1) or (0.0,)
         category = str(fields.get("category_id", ""))
-        named = category, fields.get("label", ""), categories.get(category, {}).get("name", "")
-        labels = frozenset(map(str, named)) - {""}
+        name = categories.get(category, {}).get("name", "")
+        labels = _labels(category, fields.get("label", ""), name)
         number = str(fields.get("image_id", ""))
         image = images.get(number, {})
         file_name = str(image.get("file_name", "") or number)
@@ -252,9 +256,9 @@ def _voc(root: ElementTree.Element) -> Iterator[ImageBox]:
         if corners is None:
             raise _refused(f"object {index}: expected <bndbox> of xmin, ymin, xmax, ymax")
         x0, y0, x1, y1 = corners
-        label = frozenset({item.findtext("name", "").strip()} - {""})
         name = f"{folder}/{image}" if folder and image else image
-        yield ImageBox((x0, y0, x1, y1), image=name, size=size, labels=label)
+        labels = _labels(item.findtext("name", "").strip())
+        yield ImageBox((x0, y0, x1, y1), image=name, size=size, labels=labels)
 
 
 def _number(element: ElementTree.Element, path: str) -> float | None:

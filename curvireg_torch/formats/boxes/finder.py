@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import takewhile
@@ -71,14 +72,15 @@ def _of_fractions(corners: Corners, size: Size) -> Corners:
             f"({kinds})"
         )
     height, width = size
-    x0, y0, x1, y1 = corners
-    return _from_centre((x0 * width, y0 * height, x1 * width, y1 * height))
+    return _from_centre(corners, width, height)
 
 
-def _from_centre(corners: Corners) -> Corners:
-    """px that count from the centre of the first pixel, of px from the picture's edge."""
+def _from_centre(corners: Corners, x: float = 1.0, y: float = 1.0) -> Corners:
+    """px that count from the centre of the first pixel, of corners from the picture's edge in x by
+    y px."""
     x0, y0, x1, y1 = corners
-    return x0 - PIXEL_CENTRE, y0 - PIXEL_CENTRE, x1 - PIXEL_CENTRE, y1 - PIXEL_CENTRE
+    edge = PIXEL_CENTRE
+    return x0 * x - edge, y0 * y - edge, x1 * x - edge, y1 * y - edge
 
 
 class BoxFile:
@@ -190,19 +192,19 @@ class BoxFile:
     @cached_property
     def _images(self) -> Mapping[str, list[ImageBox]]:
         """The boxes of a file, by the photograph as the file names it."""
-        images: dict[str, list[ImageBox]] = {}
+        images = defaultdict(list)
         for box in read_boxes(self.path):
-            images.setdefault(box.image, []).append(box)
+            images[box.image].append(box)
         return images
 
     @cached_property
     def _names(self) -> Mapping[str, list[str]]:
         """The images of a file by the names that a photograph may be found by."""
-        names: dict[str, list[str]] = {}
+        names = defaultdict(list)
         for image in self._images:
-            last = PurePosixPath(_posix(image)).name
-            for name in dict.fromkeys((last, _stem(last), without_zeros(_stem(last)))):
-                names.setdefault(name, []).append(image)
+            path = PurePosixPath(_posix(image))
+            for name in {path.name, path.stem, without_zeros(path.stem)}:
+                names[name].append(image)
         return names
 
     @cached_property
@@ -214,23 +216,19 @@ class BoxFile:
     def _distinguishing_folders(self, image: str) -> int:
         """Number of folders of an image that those around a photograph must match."""
         folders = _folders(image)
-        is_scene = ANY_FOLDER in folders
-        return len(folders) - (0 if is_scene else self._common_folders)
+        return len(folders) - (0 if ANY_FOLDER in folders else self._common_folders)
 
     def _image(self, photo: Path) -> tuple[str, bool]:
         """The image of a file that is a photograph, and whether one of its folders says so."""
         around = _folders(os.path.abspath(photo))
         for name in (photo.name, photo.stem, without_zeros(photo.stem)):
-            counts = {
-                image: _matching(_folders(image), around) for image in self._names.get(name, [])
-            }
-            matches = {
-                image: count
-                for image, count in counts.items()
-                if count >= self._distinguishing_folders(image)
-            }
-            most = max(matches.values(), default=0)
-            chosen = [image for image, count in matches.items() if count == most]
+            counts = {}
+            for image in self._names.get(name, []):
+                count = _matching(_folders(image), around)
+                if count >= self._distinguishing_folders(image):
+                    counts[image] = count
+            most = max(counts.values(), default=0)
+            chosen = [image for image, count in counts.items() if count == most]
             if len(chosen) > 1:
                 names = " and ".join(chosen[:3])
                 raise InvalidInputError(
@@ -245,10 +243,6 @@ def _posix(name: str) -> str:
     return name.replace("\\", "/")
 
 
-def _stem(name: str) -> str:
-    return PurePosixPath(name).stem
-
-
 def _folders(name: str) -> list[str]:
     """The folders of a path, numbers without zeros in front."""
     parts = PurePosixPath(_posix(name)).parts[:-1]
@@ -257,12 +251,8 @@ def _folders(name: str) -> list[str]:
 
 def _matching(folders: Sequence[str], around: Sequence[str]) -> int:
     """How many folders at the end of two paths are the same."""
-    count = 0
-    for ours, theirs in zip(reversed(folders), reversed(around), strict=False):
-        if ours not in (theirs, ANY_FOLDER):
-            break
-        count += 1
-    return count
+    pairs = zip(reversed(folders), reversed(around), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] in (pair[1], ANY_FOLDER), pairs))
 
 
 def _best(boxes: Sequence[ImageBox], photograph: str) -> ImageBox:
@@ -299,12 +289,12 @@ def _in_pixels(box: ImageBox, picture: Callable[[], PictureSize]) -> Corners:
         return _of_fractions(box.corners, picture().shown)
     if box.size is None:
         return _from_centre(box.corners)
-    return _from_centre(_fitted(box.corners, box.size, picture()))
+    return _fitted(box.corners, box.size, picture())
 
 
 def _fitted(corners: Corners, size: Size, picture: PictureSize) -> Corners:
-    """The corners in a photograph of those in a picture of another size, or that was not turned as
-    its EXIF data say."""
+    """The corners in px of a photograph, of those in a picture of another size, or that was not
+    turned as its EXIF data say."""
     if not _has_proportions(size, picture.shown):
         if not _has_proportions(size, picture.stored):
             boxed = f"{size[1]} x {size[0]} px"
@@ -315,10 +305,8 @@ def _fitted(corners: Corners, size: Size, picture: PictureSize) -> Corners:
             )
         corners = _turned(corners, size, picture.orientation)
         size = size[::-1]
-    y = picture.shown[0] / size[0]
-    x = picture.shown[1] / size[1]
-    x0, y0, x1, y1 = corners
-    return x0 * x, y0 * y, x1 * x, y1 * y
+    height, width = picture.shown
+    return _from_centre(corners, width / size[1], height / size[0])
 
 
 def _has_proportions(size: Size, other: Size) -> bool:

@@ -167,10 +167,9 @@ def _found(value: Any, path: tuple[str, ...], around: tuple[Document, ...]) -> I
     """The cameras in a document, each before those inside it."""
     if isinstance(value, list):
         for index, item in enumerate(value):
-            names = (
-                [item[key] for key in _ITEM_NAMES if key in item] if isinstance(item, dict) else []
-            )
-            yield from _found(item, (*path, str([*names, index][0])), around)
+            fields = item if isinstance(item, dict) else {}
+            name = next((fields[key] for key in _ITEM_NAMES if key in fields), index)
+            yield from _found(item, (*path, str(name)), around)
     if not isinstance(value, dict):
         return
     record = Record(value, set())

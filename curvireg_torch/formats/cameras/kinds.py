@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from ...errors import CurviregWarning, InvalidInputError
 from ...utils.aliases import Size
 from ..documents import number
@@ -154,18 +156,15 @@ def _matrix_rows(numbers: Sequence[float]) -> list[list[float]]:
         raise InvalidInputError(
             f"camera matrix: expected 9 numbers, or fx, fy, cx, cy, got {count}"
         )
-    width = 3 if count == 9 else 4
-    rows = [list(numbers[start : start + width]) for start in range(0, count, width)]
-    beyond = [value for row in rows[:3] for value in row[3:]] + [
-        x for row in rows[3:] for x in row[:3]
-    ]
-    if any(beyond):
+    K = np.reshape(numbers, (-1, 3 if count == 9 else 4))
+    if K[:3, 3:].any() or K[3:, :3].any():
         raise InvalidInputError(
             "camera matrix: expected 3 x 3 numbers, got a projection that also moves the camera"
         )
-    rows = [row[:3] for row in rows[:3]]
-    by_column = any(rows[2][:2]) and not (rows[0][2] or rows[1][2])
-    return [list(column) for column in zip(*rows, strict=True)] if by_column else rows
+    K = K[:3, :3]
+    is_by_column = K[2, :2].any() and not K[:2, 2].any()
+    rows: list[list[float]] = (K.T if is_by_column else K).tolist()
+    return rows
 
 
 def _read_matrix(record: Record) -> list[float]:
@@ -257,22 +256,21 @@ def _single_coefficients(record: Record, model: str | None) -> list[float]:
     singles = {name: record.number(name) for name in ORDER}
     if all(value is None for value in singles.values()):
         return []
-    if model == FISHEYE:
-        if any(singles[name] for name in ORDER if name not in ("k1", "k2", "k3", "k4")):
-            raise InvalidInputError(
-                "distortion: a fisheye has k1, k2, k3, k4 alone; check the camera's model"
-            )
-        return [singles[name] or 0.0 for name in ("k1", "k2", "k3", "k4")]
-    return padded([singles[name] or 0.0 for name in ORDER])
+    if model != FISHEYE:
+        return padded([value or 0.0 for value in singles.values()])
+    fisheye = [singles.pop(name) or 0.0 for name in ("k1", "k2", "k3", "k4")]
+    if any(singles.values()):
+        raise InvalidInputError(
+            "distortion: a fisheye has k1, k2, k3, k4 alone; check the camera's model"
+        )
+    return fisheye
 
 
 def padded(coefficients: Sequence[float]) -> list[float]:
     """The coefficients, without zeros at the end, up to one of the numbers that OpenCV has."""
-    values = list(coefficients)
-    while values and values[-1] == 0.0:
-        values.pop()
-    count = next(count for count in (0, 4, 5, 8, 12, 14, len(values)) if count >= len(values))
-    return [*values, *[0.0] * (count - len(values))]
+    last = max((k for k, value in enumerate(coefficients, start=1) if value), default=0)
+    count = next(count for count in (0, 4, 5, 8, 12, 14, last) if count >= last)
+    return [*coefficients[:last], *[0.0] * (count - last)]
 
 
 def _read_size(record: Record) -> list[float]:
@@ -393,14 +391,12 @@ def _region(record: Record, camera: CameraRecord) -> CameraRecord:
     names = ("x_offset", "y_offset", "width", "height")
     left, top, width, height = (roi.number(name) or 0.0 for name in names)
     steps = [max(1.0, record.number(name) or 1.0) for name in ("binning_x", "binning_y")]
-    if (left, top, width, height, *steps) == (0.0, 0.0, 0.0, 0.0, 1.0, 1.0):
-        return camera
-    H, W = camera.size or (0, 0)
     rows = [
         # a pixel covers the ``step`` ones from its first edge on
-        (a / step, b / step, (c + 0.5 - offset) / step - 0.5)
+        (a / step, b / step, (c - offset + (1.0 - step) / 2) / step)
         for (a, b, c), step, offset in zip(camera.matrix, steps, (left, top), strict=False)
     ]
+    H, W = camera.size or (0, 0)
     size = int((height or H - top) // steps[1]), int((width or W - left) // steps[0])
     matrix = (*rows, camera.matrix[2])
     return replace(camera, matrix=matrix, size=size if min(size) > 0 else None)
@@ -446,10 +442,8 @@ def _opensfm(record: Record) -> CameraRecord:
     longer = max(size)
     cx = longer * (record.number("c_x") or 0.0) + (W - 1) / 2
     cy = longer * (record.number("c_y") or 0.0) + (H - 1) / 2
-    model = OPENSFM[name]
-    return _camera_from(
-        [longer * fx, longer * fy, cx, cy], _single_coefficients(record, model), model, size
-    )
+    lens = _single_coefficients(record, OPENSFM[name])
+    return _camera_from([longer * fx, longer * fy, cx, cy], lens, OPENSFM[name], size)
 
 
 def _kitti(record: Record) -> CameraRecord:
@@ -500,26 +494,20 @@ def _metashape(record: Record) -> CameraRecord:
     size = _read_size(record)
     if len(size) != 2:
         raise InvalidInputError("no width and height beside f; export the calibration again")
-    names = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+    names = _names("f cx cy b1 k1 k2 k3 k4 p1 p2 b2 p3 p4")
     values = {name: record.number(name) or 0.0 for name in names}
+    f, cx, cy, b1, k1, k2, k3, k4, p1, p2, *_ = values.values()
     model = _read_model(record) or RADIAL_TANGENTIAL
-    unread = [name for name in ("b2", "p3", "p4") if values[name]]
-    unread += ["k4"] if values["k4"] and model != FISHEYE else []
-    unread += [name for name in ("p1", "p2") if values[name] and model == FISHEYE]
-    if unread:
-        message = (
-            f"{', '.join(unread)} of Metashape have no counterpart in OpenCV; optimise the "
-            f"cameras without them"
+    others = ("b2", "p1", "p2", "p3", "p4") if model == FISHEYE else ("b2", "k4", "p3", "p4")
+    if unread := [name for name in others if values[name]]:
+        raise InvalidInputError(
+            f"distortion: {', '.join(unread)} of Metashape have no counterpart in OpenCV; "
+            "optimise the cameras without them"
         )
-        raise InvalidInputError(f"distortion: {message}")
-    cx, cy = (side / 2 + values[name] - 0.5 for side, name in zip(size, ("cx", "cy"), strict=True))
-    radial = [values[name] for name in ("k1", "k2", "k3", "k4")]
-    lens = (
-        radial if model == FISHEYE else padded([*radial[:2], values["p2"], values["p1"], radial[2]])
-    )
-    return _camera_from(
-        [values["f"] + values["b1"], values["f"], cx, cy], lens, model, _checked_size(size)
-    )
+    lens = [k1, k2, k3, k4] if model == FISHEYE else padded([k1, k2, p2, p1, k3])
+    width, height = size
+    matrix = [f + b1, f, width / 2 + cx - 0.5, height / 2 + cy - 0.5]
+    return _camera_from(matrix, lens, model, _checked_size(size))
 
 
 def _kannala_brandt(record: Record) -> CameraRecord:

@@ -1,10 +1,12 @@
 """Poses as messages of ROS, in YAML: metres, in the camera's optical frame or in the world."""
 
 import argparse
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
+import yaml
 
 from ...errors import InvalidInputError
 from ...utils.aliases import Document
@@ -55,35 +57,30 @@ def write_ros(
     """
     if document["translation"] is None:
         raise InvalidInputError("--format ros: a pose without translation; give a camera")
-    w, x, y, z = document["quaternion"]
     metres = UNITS[document["unit"] or "m"]
-    px, py, pz = (v * metres for v in document["translation"])
-    position = f"{{x: {px:.9g}, y: {py:.9g}, z: {pz:.9g}}}"
-    orientation = f"{{x: {x:.12g}, y: {y:.12g}, z: {z:.12g}, w: {w:.12g}}}"
-    frame_id = _text("world" if document["frame"] == "world" else frame)
-    child_id = _text(re.sub(r"[^\w/-]", "_", child))  # as names of ROS may be
-    header = f"{{stamp: {{sec: {stamp[0]}, nanosec: {stamp[1]}}}, frame_id: {frame_id}}}"
-    pose = f"{{position: {position}, orientation: {orientation}}}"
-    transform = f"{{translation: {position}, rotation: {orientation}}}"
-    texts = {
-        "pose.yaml": f"header: {header}\npose: {pose}\n",
-        "tf.yaml": f"transforms:\n- header: {header}\n  child_frame_id: {child_id}\n"
-        f"  transform: {transform}\n",
+    position = dict(zip("xyz", (metres * x for x in document["translation"]), strict=True))
+    orientation = dict(zip("wxyz", document["quaternion"], strict=True))
+    header = {
+        "stamp": dict(zip(("sec", "nanosec"), stamp, strict=True)),
+        "frame_id": "world" if document["frame"] == "world" else frame,
+    }
+    pose = {"position": position, "orientation": orientation}
+    transform = {
+        "header": header,
+        "child_frame_id": re.sub(r"[^\w/-]", "_", child),  # as names of ROS may be
+        "transform": {"translation": position, "rotation": orientation},
+    }
+    contents = {
+        "pose.yaml": {"header": header, "pose": pose},
+        "tf.yaml": {"transforms": [transform]},
     }
     if document["covariance"] is not None:
-        covariance = ros_covariance(document["covariance"], metres)
-        numbers = ", ".join(f"{value:.9g}" for row in covariance for value in row)
-        texts["pose_with_covariance.yaml"] = (
-            f"header: {header}\npose:\n  pose: {pose}\n  covariance: [{numbers}]\n"
-        )
-    for name in FILES:
-        if name in texts:
-            write_file(out / name, texts[name].encode())
-
-
-def _text(name: str) -> str:
-    """A name in YAML, in quotes where it would be read otherwise."""
-    return name if re.fullmatch(r"[A-Za-z]\w*(/\w+)*", name) else json.dumps(name)
+        covariance = np.ravel(ros_covariance(document["covariance"], metres)).tolist()
+        message = {"header": header, "pose": {"pose": pose, "covariance": covariance}}
+        contents["pose_with_covariance.yaml"] = message
+    for name, content in contents.items():
+        text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True)
+        write_file(out / name, text.encode())
 
 
 def ros_covariance(covariance: Sequence[Sequence[float]], metres: float) -> list[list[float]]:
@@ -97,11 +94,7 @@ def ros_covariance(covariance: Sequence[Sequence[float]], metres: float) -> list
         >>> [row[3] for row in ros_covariance(ours, 0.001)]
         [0.2, 0.0, 0.0, 1.0, 0.0, 0.0]
     """
-    scaled = [
-        [
-            value * (metres if i >= 3 else 1.0) * (metres if j >= 3 else 1.0)
-            for j, value in enumerate(row)
-        ]
-        for i, row in enumerate(covariance)
-    ]
-    return [[scaled[i][j] for j in ORDER] for i in ORDER]
+    scale = np.array([1.0, 1.0, 1.0, metres, metres, metres])
+    scaled = np.array(covariance) * np.outer(scale, scale)
+    ordered: list[list[float]] = scaled[np.ix_(ORDER, ORDER)].tolist()
+    return ordered

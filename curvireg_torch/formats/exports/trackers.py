@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from trimesh.transformations import transform_points
 
 from ...errors import InvalidInputError
 from ...utils.aliases import Document
@@ -135,7 +136,7 @@ def _axis_angle(quaternion: Sequence[float]) -> Floats:
 
 def _pixels(points: Floats, T: Floats, K: Sequence[Sequence[float]]) -> Floats:
     """(N, 2) pixels of points (N, 3)."""
-    seen = (points @ T[:3, :3].T + T[:3, 3]) @ np.array(K).T
+    seen = transform_points(points, T) @ np.array(K).T
     pixels: Floats = seen[:, :2] / seen[:, 2:]
     return pixels
 
@@ -146,16 +147,14 @@ def _spread(points: Floats, count: int) -> list[int]:
     nearest = np.linalg.norm(points - points[chosen[0]], axis=1)
     while len(chosen) < min(count, len(points)) and nearest.max() > 0:
         chosen.append(int(nearest.argmax()))
-        distance = np.linalg.norm(points - points[chosen[-1]], axis=1)
-        nearest = np.minimum(nearest, distance)
+        nearest = np.minimum(nearest, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return chosen
 
 
 def polygons_of(mesh: trimesh.Trimesh) -> list[list[int]]:
     """Corners of the polygons of a mesh, counter-clockwise from outside: triangles in one plane are
     one polygon, unless it would have holes."""
-    angles = mesh.face_adjacency_angles
-    flat = mesh.face_adjacency[angles < FLAT_ANGLE]
+    flat = mesh.face_adjacency[mesh.face_adjacency_angles < FLAT_ANGLE]
     label = trimesh.graph.connected_component_labels(flat, node_count=len(mesh.faces))
     polygons: list[list[int]] = []
     for number in np.unique(label):
@@ -165,18 +164,13 @@ def polygons_of(mesh: trimesh.Trimesh) -> list[list[int]]:
     return polygons
 
 
-def _outline(faces: Floats) -> list[int] | None:
+def _outline(faces: Integers) -> list[int] | None:
     """The corners around triangles (F, 3) in their order; None if that is no single loop."""
-    edges = {
-        (int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)
-    }
-    border = {a: b for a, b in edges if (b, a) not in edges}
-    if len(border) != sum((b, a) not in edges for a, b in edges) or not border:
-        return None
-    first = next(iter(border))
-    corners = [first]
-    while (corner := border.get(corners[-1], first)) != first:
-        corners.append(corner)
-        if len(corners) > len(border):
-            return None
-    return corners if len(corners) == len(border) else None
+    edges = set(map(tuple, trimesh.geometry.faces_to_edges(faces).tolist()))
+    outer = [(a, b) for a, b in edges if (b, a) not in edges]
+    following = dict(outer)
+    corners = [a for a, _ in outer[:1]]
+    for _ in outer[1:]:
+        corners.append(following.get(corners[-1], -1))
+    is_loop = bool(outer) and len(outer) == len(following) == len(following.keys() & corners)
+    return corners if is_loop else None

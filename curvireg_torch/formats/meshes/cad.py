@@ -1,6 +1,7 @@
 """STEP and IGES files by cascadio, which is OpenCASCADE, and Collada files by pycollada: the extra
 ``cad``."""
 
+import re
 import tempfile
 import warnings
 from dataclasses import replace
@@ -8,7 +9,6 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import trimesh
 from PIL import Image
 
@@ -36,7 +36,9 @@ _PROGRAM = Path(__file__).with_name("step_parts.py")
 IGES_METRES = 1e-3  # OpenCASCADE leaves the triangles of IGES files in mm
 _PREFIXES = {b".MILLI.": "mm", b".CENTI.": "cm", b".DECI.": "dm", b"$": "m"}
 _CONVERSIONS = {b"'INCH'": "in", b"'IN'": "in", b"'FOOT'": "ft", b"'FT'": "ft"}
+_IGES_TEXT = re.compile(rb"\s*(\d{1,4})H")  # the length of a text, which may hold separators
 _IGES_FLAGS = {b"1": "in", b"2": "mm", b"4": "ft", b"6": "m", b"10": "cm"}
+_WORD = re.compile(r"\S+")
 
 
 def bounded(source: MeshSource) -> bytes:
@@ -89,20 +91,14 @@ def _converted(path: Path, kind: str) -> bytes:
 def step_unit(data: bytes) -> str | None:
     """The unit of length of a STEP file, None if it is none of ``UNITS``."""
     units: dict[bytes, str | None] = {}
-    contexts: list[list[bytes]] = []
+    used: list[bytes] = []
     for entity in data.split(b";"):
-        name, equals, content = entity.partition(b"=")
-        if not equals:
-            continue
+        name, _, content = entity.partition(b"=")
         if b"LENGTH_UNIT" in content:
             units[name.strip()] = _length_unit(content.replace(b" ", b"").upper())
-        _, found, arguments = content.partition(b"GLOBAL_UNIT_ASSIGNED_CONTEXT")
-        if found:
-            contexts.append(
-                arguments.partition(b"))")[0].replace(b"(", b" ").replace(b",", b" ").split()
-            )
-    used = [units[name] for names in contexts for name in names if name in units]
-    return used[0] if used else None
+        _, _, arguments = content.partition(b"GLOBAL_UNIT_ASSIGNED_CONTEXT")
+        used += re.findall(rb"#\d+", arguments.partition(b"))")[0])
+    return next((units[name] for name in used if name in units), None)
 
 
 def _length_unit(content: bytes) -> str | None:
@@ -119,24 +115,18 @@ def iges_unit(data: bytes) -> str | None:
     ``UNITS``."""
     lines = [line for line in data.splitlines() if line[72:73] == b"G"]
     text = b"".join(line[:72].ljust(72) for line in lines[:100])
-    separator = b"," if not text.startswith(b"1H") else text[2:3]
-    values: list[bytes] = []
-    while text and len(values) < 14:
-        digits, letter, _ = text.lstrip().partition(b"H")
-        if letter and digits.isdigit() and len(digits) < 5:  # a text, preceded by its length
-            text = text.lstrip()
-            end = len(digits) + 1 + int(digits)
-            value = text[len(digits) + 1 : end]
-            rest = text[end:]
+    separator = text[2:3] if text.startswith(b"1H") else b","
+    value = b""
+    for _ in range(14):
+        if counted := _IGES_TEXT.match(text):
+            value = b""
+            text = text[counted.end() + int(counted[1]) :].lstrip()[1:]
         else:
-            value, _, rest = text.partition(separator)
-            rest = separator + rest
-        values.append(value.strip())
-        text = rest.lstrip()[1:]
-    return _IGES_FLAGS.get(values[13]) if len(values) == 14 else None
+            value, _, text = text.partition(separator)
+    return _IGES_FLAGS.get(value.strip())
 
 
-class _Pictures(trimesh.resolvers.Resolver):  # type: ignore[misc]
+class _Pictures:
     """The pictures that a Collada file names, each decoded once and reduced as textures are.
     trimesh asks for one again for each material, and keeps each answer as a picture of its own."""
 
@@ -146,6 +136,7 @@ class _Pictures(trimesh.resolvers.Resolver):  # type: ignore[misc]
         self._pixels_left = MAX_TEXTURE_PIXELS
 
     def get(self, name: str) -> bytes:
+        """The content of a file of the picture; trimesh goes on after any error."""
         pixels = self._source.texture_file(*spellings(name.encode(errors="surrogateescape")))
         if pixels is None:
             raise ValueError("no such picture")
@@ -158,15 +149,6 @@ class _Pictures(trimesh.resolvers.Resolver):  # type: ignore[misc]
             Image.fromarray(pixels).save(file, "PNG", compress_level=1)
             self._answers[name] = file.getvalue()
         return self._answers[name]
-
-    def keys(self) -> list[str]:
-        return []
-
-    def write(self, name: str, data: Any) -> None:
-        raise ValueError("nothing is written")
-
-    def namespaced(self, namespace: str) -> "_Pictures":
-        return self
 
 
 def read_collada(source: MeshSource) -> ReadMesh:
@@ -190,11 +172,14 @@ def read_collada(source: MeshSource) -> ReadMesh:
     return replace(found, up={"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}.get(axis))
 
 
+_GROUPS = ("node", "visual_scene", "library_visual_scenes", "library_nodes")
+"""Elements of Collada whose children are nodes, or stand for some."""
+
+
 def _check_copies(root: Any) -> None:
     """Nodes that stand for others, which stand for others: the parts and faces that they unfold to
     are counted first."""
     named = {f"#{one.get('id')}": one for one in root.iter() if one.get("id")}
-    nodes = {url: one for url, one in named.items() if local_name(one) == "node"}
     known: dict[Any, tuple[int, int]] = {}
     faces_of: dict[str, int] = {}
 
@@ -207,30 +192,33 @@ def _check_copies(root: Any) -> None:
         return faces_of[url]
 
     def count(node: Any, depth: int) -> tuple[int, int]:
+        """The parts and faces below a node."""
         if node in known:
             return known[node]
         if depth > 200:
             raise ValueError("its nodes form a circle, or are too deep")
-        found = []
+        parts = total = 0
         for child in node:
             kind = local_name(child)
             url = str(child.get("url"))
-            if kind in ("node", "visual_scene", "library_visual_scenes", "library_nodes"):
-                found.append(count(child, depth + 1))
-            elif kind == "instance_node" and url in nodes:
-                found.append(count(nodes[url], depth + 1))
+            more = 0, 0
+            if kind == "instance_node" and local_name(named.get(url, child)) == "node":
+                more = count(named[url], depth + 1)
+            elif kind in _GROUPS:
+                more = count(child, depth + 1)
             elif kind in ("instance_geometry", "instance_controller"):
-                found.append((1, faces(url)))
-        parts = sum(one[0] for one in found)
-        total = sum(one[1] for one in found)
+                more = 1, faces(url)
+            parts += more[0]
+            total += more[1]
         known[node] = parts, total
         check_parts(parts)
         check_faces(total)
         return known[node]
 
     count(root, 0)
-    for node in nodes.values():
-        count(node, 0)
+    for node in root.iter():
+        if local_name(node) == "node":
+            count(node, 0)
 
 
 def _most_faces(geometry: Any) -> int:
@@ -241,13 +229,7 @@ def _most_faces(geometry: Any) -> int:
             int(child.get("offset", "0")) for child in element if local_name(child) == "input"
         ]
         lists = [child.text or "" for child in element if local_name(child) == "p"]
-        if lists:
-            corners = sum(map(_word_count, lists)) // (max(offsets, default=0) + 1)
-            total += corners // 3 if local_name(element) == "triangles" else corners
+        words = sum(1 for text in lists for _ in _WORD.finditer(text))
+        corners = words // (max(offsets, default=0) + 1)
+        total += corners // 3 if local_name(element) == "triangles" else corners
     return total
-
-
-def _word_count(text: str) -> int:
-    """``len(text.split())`` without the words, which take much more memory than the text."""
-    is_blank = np.frombuffer(text.encode(), np.uint8) <= ord(" ")
-    return int((is_blank[:-1] & ~is_blank[1:]).sum()) + int(len(is_blank) > 0 and not is_blank[0])

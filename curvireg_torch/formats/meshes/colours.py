@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ BOX = Resampling.BOX
 TEXTURE_SIDE = 512  # Textures are reduced to this longer side in px; views are smaller
 LARGE = 1 << 25  # Pixels of a texture that is reduced in its own mode first
 _UNSET = (102, 102, 102)  # trimesh's colour for a material without one
-_PLAIN = 255
 # by their ids, images, which so keep them, and pixels
 _Textures = dict[int, tuple[Any, Bytes | None]]
 
@@ -56,22 +55,33 @@ class SurfaceColours:
 
     def check(self, faces: int) -> None:
         """Raise ValueError unless these are valid colours of ``faces`` faces."""
-        parts = (self.corners, (faces, 3, 3), np.uint8), (self.uv, (faces, 3, 2), np.float32)
-        valid = all(x.shape == shape and x.dtype == dtype for x, shape, dtype in parts)
-        valid = valid and self.texture.shape == (faces,) and self.texture.dtype == np.int32
-        valid = valid and all(
-            t.ndim == 3 and t.shape[2] == 3 and t.size and t.dtype == np.uint8
-            for t in self.textures
+
+        def fits(x: NDArray[Any], shape: tuple[int, ...], dtype: type) -> bool:
+            return x.shape == shape and x.dtype == dtype
+
+        is_valid = (
+            fits(self.corners, (faces, 3, 3), np.uint8)
+            and fits(self.uv, (faces, 3, 2), np.float32)
+            and fits(self.texture, (faces,), np.int32)
+            and all(x.size and fits(x, (*x.shape[:2], 3), np.uint8) for x in self.textures)
+            and np.isfinite(self.uv).all()
+            and -1 <= self.texture.min() <= self.texture.max() < len(self.textures)
         )
-        valid = valid and bool(np.isfinite(self.uv).all())
-        if not (valid and -1 <= self.texture.min() <= self.texture.max() < len(self.textures)):
+        if not is_valid:
             raise ValueError("colours that do not match the mesh")
 
     @classmethod
-    def plain(cls, faces: int, colour: Any = (_PLAIN,) * 3) -> "SurfaceColours":
-        """One colour everywhere, white by default."""
-        corners = np.broadcast_to(np.array(colour, np.uint8), (faces, 3, 3))
+    def plain(cls, faces: int, colour: Any = (255, 255, 255)) -> "SurfaceColours":
+        """One colour everywhere, white by default, in arrays that a reader may change."""
+        corners = np.full((faces, 3, 3), colour, np.uint8)
         return cls(corners, np.zeros((faces, 3, 2), np.float32), np.full(faces, -1, np.int32))
+
+    def with_texture(self, faces: Any, texture: Bytes, uv: Floats | Singles) -> "SurfaceColours":
+        """These colours, whose arrays change, with a texture on ``faces``, an index, at the
+        coordinates (N, 3, 2) of their corners."""
+        self.uv[faces] = np.nan_to_num(uv, posinf=0.0, neginf=0.0)
+        self.texture[faces] = len(self.textures)
+        return replace(self, textures=(*self.textures, texture))
 
     @classmethod
     def cat(cls, parts: Sequence["SurfaceColours"]) -> "SurfaceColours":
@@ -87,30 +97,6 @@ class SurfaceColours:
             np.concatenate(texture).astype(np.int32),
             tuple(textures.values()),
         )
-
-
-class Painting:
-    """Colours of F faces in the making: white at first, without a texture.
-
-    Attributes:
-        corners: (F, 3, 3) uint8 RGB, which readers change.
-    """
-
-    def __init__(self, faces: int) -> None:
-        self.corners = np.full((faces, 3, 3), _PLAIN, np.uint8)
-        self._uv = np.zeros((faces, 3, 2), np.float32)
-        self._texture = np.full(faces, -1, np.int32)
-        self._textures: list[Bytes] = []
-
-    def add_texture(self, faces: Any, texture: Bytes, uv: Floats | Singles) -> None:
-        """Give ``faces``, an index, a texture at the coordinates (N, 3, 2) of their corners."""
-        self._uv[faces] = np.nan_to_num(uv, posinf=0.0, neginf=0.0)
-        self._texture[faces] = len(self._textures)
-        self._textures.append(texture)
-
-    def finished(self) -> SurfaceColours:
-        """The colours."""
-        return SurfaceColours(self.corners, self._uv, self._texture, tuple(self._textures))
 
 
 def byte_colours(fractions: Any) -> Bytes:
@@ -140,13 +126,13 @@ def _surface_colours(mesh: Any, known: _Textures) -> SurfaceColours | None:
     white."""
     visual = mesh.visual
     faces = np.asarray(mesh.faces)
-    painting = Painting(len(faces))
+    found = SurfaceColours.plain(len(faces))
     if visual.kind == "face":
-        painting.corners[:] = np.asarray(visual.face_colors, np.uint8)[:, None, :3]
-        return painting.finished()
+        found.corners[:] = np.asarray(visual.face_colors, np.uint8)[:, None, :3]
+        return found
     if visual.kind == "vertex":
-        painting.corners[:] = np.asarray(visual.vertex_colors, np.uint8)[faces][..., :3]
-        return painting.finished()
+        found.corners[:] = np.asarray(visual.vertex_colors, np.uint8)[faces][..., :3]
+        return found
     if visual.kind != "texture":
         return None
     material = visual.material
@@ -155,17 +141,16 @@ def _surface_colours(mesh: Any, known: _Textures) -> SurfaceColours | None:
     factor = getattr(material, "baseColorFactor", None)
     texture = None if image is None or visual.uv is None else _decoded(image, known)
     if factor is not None:  # linear, as factors in glTF are
-        painting.corners[:] = byte_colours(srgb(np.asarray(factor[:3], np.float64) / 255))
+        found.corners[:] = byte_colours(srgb(np.asarray(factor[:3], np.float64) / 255))
     elif texture is None:
         colour = tuple(material.main_color[:3])
         if colour == _UNSET:
             return None
-        painting.corners[:] = colour
-    if texture is not None:
-        painting.add_texture(
-            slice(None), texture, np.asarray(visual.uv, np.float32)[faces][..., :2]
-        )
-    return painting.finished()
+        found.corners[:] = colour
+    if texture is None:
+        return found
+    uv = np.asarray(visual.uv, np.float32)[faces][..., :2]
+    return found.with_texture(slice(None), texture, uv)
 
 
 def _decoded(image: Any, known: _Textures) -> Bytes | None:

@@ -20,7 +20,7 @@ from .gltf import read_gltf
 from .limits import check_lines
 from .obj import read_obj
 from .ply import read_ply
-from .polygons import triangles_of_faces
+from .polygons import triangulated
 from .source import MeshSource, ReadMesh, plain_text
 from .stl import read_stl
 from .threemf import read_threemf
@@ -117,8 +117,6 @@ def read_source(source: MeshSource, link: str | None = None) -> ReadMesh:
             return READERS[suffix](source)
     except CurviregError as error:
         raise error.with_subject(path) from None
-    except IndexError as error:
-        raise _unreadable(path, "a face names a vertex that the file lacks") from error
     except Exception as error:
         words = f"{type(error).__name__}: {error}".removeprefix("ValueError: ").split()
         reason = " ".join(words)[:300]
@@ -157,13 +155,16 @@ def _read_off(source: MeshSource) -> ReadMesh:
     if len(header) > 16 or not lines:
         raise ValueError("not an OFF file")
     V, F = map(int, lines[0][:2])
-    if V < 0 or F < 0 or len(lines) < 1 + V + F:
+    points = lines[1 : 1 + V]
+    rows = lines[1 + V : 1 + V + F]
+    faces = [row[1 : 1 + int(row[0])] for row in rows]
+    is_cut = len(lines) < 1 + V + F or (F > 0 and len(faces[-1]) < int(rows[-1][0]))
+    if min(V, F) < 0 or is_cut:
         raise ValueError("the file ends too early")
-    vertices = np.array([line[:3] for line in lines[1 : 1 + V]], dtype=np.float64).reshape(-1, 3)
-    faces = [list(map(int, line[1 : 1 + int(line[0])])) for line in lines[1 + V : 1 + V + F]]
-    if F and len(faces[-1]) < int(lines[V + F][0]):
-        raise ValueError("the file ends too early")
-    return ReadMesh(vertices, triangles_of_faces(vertices, faces)[0])
+    vertices = np.array([point[:3] for point in points], np.float64).reshape(-1, 3)
+    corners = np.array([word for face in faces for word in face], np.int64)
+    picked, _ = triangulated(vertices, corners, np.array([*map(len, faces)], np.int64))
+    return ReadMesh(vertices, corners[picked])
 
 
 READERS: dict[str, Callable[[MeshSource], ReadMesh]] = {

@@ -22,9 +22,9 @@ from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TABLE_BYTES
 from ...utils.aliases import Fields
 from ...utils.arrays import Array, Bytes, Floats, Integers
 from ...utils.srgb import srgb
-from .colours import Painting, SurfaceColours, byte_colours
-from .limits import check_faces, check_parts
-from .source import MeshSource, ReadMesh, as_plain_numbers
+from .colours import SurfaceColours, byte_colours
+from .limits import check_corners, check_faces, check_parts
+from .source import MeshSource, ReadMesh, fixed_numbers
 
 # Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or are
 # read here
@@ -52,8 +52,7 @@ _TRANSFORM = "KHR_texture_transform"
 def read_gltf(source: MeshSource, data: bytes | None = None) -> ReadMesh:
     """Read a glTF or GLB file, or the ``data`` of one, as one mesh in its scene's frame; skins as
     the joints stand."""
-    data = source.data() if data is None else data
-    text, binary = _chunks(data)
+    text, binary = _chunks(source.data() if data is None else data)
     if len(text) > MAX_TABLE_BYTES:
         raise ValueError(f"its JSON is larger than {MAX_TABLE_BYTES:,} bytes")
     try:
@@ -95,14 +94,9 @@ def _check(tree: Any) -> None:
     """Refuse what is not read, or would take too much memory, before anything is copied."""
     if not str(tree["asset"]["version"]).startswith("2."):
         raise ValueError(_OTHER_VERSION)
-    names = [str(name) for name in tree.get("extensionsRequired", [])]
-    names += [
-        name
-        for node in tree.get("nodes", [])
-        for name in node.get("extensions", {})
-        if "instancing" in name
-    ]
-    for name in names:
+    used = [name for node in tree.get("nodes", []) for name in node.get("extensions", {})]
+    names = [*tree.get("extensionsRequired", []), *(name for name in used if "instancing" in name)]
+    for name in map(str, names):
         if not name.startswith(_READ_EXTENSIONS):
             raise ValueError(
                 f"it requires the glTF extension {name[:60]}, which is not read; export without it"
@@ -122,9 +116,7 @@ def _check_sizes(tree: Fields) -> None:
     """Bounds on views of buffers, accessors, and every copy of a part."""
     accessors = tree.get("accessors", [])
     copied = sum(_natural(view["byteLength"]) for view in tree.get("bufferViews", []))
-    claimed = sum(
-        4 * _WIDTHS[accessor["type"]] * _natural(accessor["count"]) for accessor in accessors
-    )
+    claimed = sum(4 * _WIDTHS[one["type"]] * _natural(one["count"]) for one in accessors)
     if max(copied, claimed) > 4 * MAX_MESH_BYTES:
         raise ValueError(
             f"its buffer views or accessors claim more than {4 * MAX_MESH_BYTES:,} bytes"
@@ -132,7 +124,7 @@ def _check_sizes(tree: Fields) -> None:
 
     def count(index: Any) -> int:
         accessor = accessors[_natural(index)]
-        if "sparse" not in accessor and "bufferView" not in accessor:
+        if accessor.keys().isdisjoint(("sparse", "bufferView")):
             raise ValueError(
                 "an accessor of a part has no data, as in compressed files; export without it"
             )
@@ -144,29 +136,38 @@ def _check_sizes(tree: Fields) -> None:
         factor = 3 if part.get("mode") in (_STRIP, _FAN) else 1
         return factor * max(map(count, used), default=0)
 
-    meshes = [
-        (len(mesh["primitives"]), sum(map(corners, mesh["primitives"])))
-        for mesh in tree.get("meshes", [])
-    ]
-    copies = [meshes[_natural(node["mesh"])] for node in tree.get("nodes", []) if "mesh" in node]
-    check_parts(sum(parts for parts, _ in copies))
-    check_faces(sum(most for _, most in copies) / 3)
+    parts_of = [mesh["primitives"] for mesh in tree.get("meshes", [])]
+    corners_of = [sum(map(corners, parts)) for parts in parts_of]
+    copies = [_natural(node["mesh"]) for node in tree.get("nodes", []) if "mesh" in node]
+    check_parts(sum(len(parts_of[mesh]) for mesh in copies))
+    check_faces(sum(corners_of[mesh] for mesh in copies) / 3)
 
 
 def _check_nodes(tree: Fields) -> None:
     """Every node must be the child of one node at most, and a root of none: else the nodes form a
     circle, or more."""
     nodes = tree.get("nodes", [])
-    scenes = tree.get("scenes", [])
     most = 10 * MAX_MESH_PARTS
     if len(nodes) > most:
         raise ValueError(f"more than {most:,} nodes; join them")
     if sum(len(skin["joints"]) for skin in tree.get("skins", [])) > most:
         raise ValueError(f"more than {most:,} joints; export it without skins")
-    named = [child for node in nodes for child in node.get("children", [])]
-    named += scenes[_natural(tree.get("scene", 0))].get("nodes", []) if scenes else []
+    named = [*_roots(tree), *_children(nodes)]
     if len(set(map(_natural, named))) < len(named) or max(named, default=-1) >= len(nodes):
         raise ValueError("a node is missing, or the child of several; or the nodes form a circle")
+
+
+def _children(nodes: list[Fields]) -> list[int]:
+    return [child for node in nodes for child in node.get("children", [])]
+
+
+def _roots(tree: Fields) -> list[int]:
+    """The nodes that stand in the scene itself; without a scene, those that are no children."""
+    if scenes := tree.get("scenes", []):
+        return list(scenes[_natural(tree.get("scene", 0))].get("nodes", []))
+    nodes = tree.get("nodes", [])
+    children = set(_children(nodes))
+    return [index for index in range(len(nodes)) if index not in children]
 
 
 class _File:
@@ -180,6 +181,10 @@ class _File:
         self._parts: dict[int, list[tuple[Fields, ReadMesh]]] = {}
         self._skins: dict[int, Floats] = {}
         self._places = dict(self._nodes())
+
+    def _item(self, kind: str, index: Any) -> Any:
+        """One of the tree's lists of buffers, materials, and so on, by its number."""
+        return self._tree[kind][_natural(index)]
 
     def mesh(self) -> ReadMesh:
         """All parts of the scene at their places."""
@@ -227,19 +232,13 @@ class _File:
 
     def _nodes(self) -> Iterator[tuple[int, Floats]]:
         """The nodes of the scene and their places in it."""
-        nodes = self._tree.get("nodes", [])
-        scenes = self._tree.get("scenes", [])
-        if scenes:
-            roots = scenes[self._tree.get("scene", 0)].get("nodes", [])
-        else:
-            children = {child for node in nodes for child in node.get("children", [])}
-            roots = [index for index in range(len(nodes)) if index not in children]
-        waiting = [(root, np.eye(4)) for root in reversed(roots)]
+        waiting = [(root, np.eye(4)) for root in reversed(_roots(self._tree))]
         while waiting:
             index, above = waiting.pop()
-            place = above @ _local(nodes[index])
+            node = self._tree["nodes"][index]
+            place = above @ _local(node)
             yield index, place
-            waiting += [(child, place) for child in reversed(nodes[index].get("children", []))]
+            waiting += [(child, place) for child in reversed(node.get("children", []))]
 
     def _mesh(self, index: int) -> list[tuple[Fields, ReadMesh]]:
         if index not in self._parts:
@@ -258,12 +257,12 @@ class _File:
 
     def _part(self, part: Fields) -> ReadMesh:
         vertices = self._accessor(part["attributes"]["POSITION"])
+        if vertices.shape[1:] != (3,):
+            raise ValueError("positions that are not of three numbers")
+        indices = np.arange(len(vertices))
         if "indices" in part:
-            indices = self._accessor(part["indices"], as_stored=True)[:, 0].astype(np.int64)
-        else:
-            indices = np.arange(len(vertices))
-        if vertices.shape[1:] != (3,) or indices.max(initial=0) >= max(len(vertices), 1):
-            raise ValueError("a face names a vertex that does not exist")
+            indices = self._stored(part["indices"])[:, 0].astype(np.int64)
+        check_corners(indices, len(vertices))
         faces = _faces(indices, part.get("mode", _TRIANGLES))
         return ReadMesh(vertices, faces, self._colours(part, faces, len(vertices)))
 
@@ -272,7 +271,7 @@ class _File:
         attributes = part["attributes"]
         if "material" not in part and "COLOR_0" not in attributes:
             return None
-        material = self._tree["materials"][_natural(part["material"])] if "material" in part else {}
+        material = self._item("materials", part["material"]) if "material" in part else {}
         factor, info = _base_colour(material)
         tint = srgb(factor)
         if "COLOR_0" in attributes:
@@ -280,21 +279,20 @@ class _File:
             if colours.shape != (count, 3):
                 raise ValueError("vertex colours that do not fit the vertices")
             tint = tint * np.clip(np.nan_to_num(colours), 0.0, 1.0)[faces]
-        painting = Painting(len(faces))
-        painting.corners[:] = byte_colours(tint)
+        painted = SurfaceColours.plain(len(faces))
+        painted.corners[:] = byte_colours(tint)
         texture = None if info is None else self._texture(info)
         if info is not None and texture is not None:
             uv = self._coordinates(info, attributes, count)
             if uv is not None:
-                painting.add_texture(slice(None), texture, uv[faces])
-        return painting.finished()
+                return painted.with_texture(slice(None), texture, uv[faces])
+        return painted
 
     def _coordinates(self, info: Fields, attributes: dict[str, int], count: int) -> Floats | None:
         """(V, 2) texture coordinates from the bottom left, in the set and by the transform that the
         texture names."""
         transform = info.get("extensions", {}).get(_TRANSFORM, {})
-        number = _natural(transform.get("texCoord", info.get("texCoord", 0)))
-        name = f"TEXCOORD_{number}"
+        name = f"TEXCOORD_{_natural(transform.get('texCoord', info.get('texCoord', 0)))}"
         if name not in attributes:
             self._source.warn(
                 "texture", f"a textured part lacks {name}; it is shown in its plain colour"
@@ -303,17 +301,17 @@ class _File:
         uv = self._accessor(attributes[name], normalized=True)
         if uv.shape != (count, 2):
             raise ValueError("texture coordinates that do not fit the vertices")
-        scale = as_plain_numbers(transform.get("scale"), 2, (1.0, 1.0))
-        offset = as_plain_numbers(transform.get("offset"), 2, (0.0, 0.0))
         angle = float(transform.get("rotation", 0.0))
         cos = math.cos(angle)
         sin = math.sin(angle)
+        scale = fixed_numbers(transform.get("scale"), 2, (1.0, 1.0))
         scaled = scale * np.nan_to_num(uv, posinf=0.0, neginf=0.0)
+        offset = fixed_numbers(transform.get("offset"), 2, (0.0, 0.0))
         turned = scaled @ np.array([[cos, -sin], [sin, cos]]) + offset
         return np.asarray(np.array([0.0, 1.0]) + turned * np.array([1.0, -1.0]))
 
     def _texture(self, info: Fields) -> Bytes | None:
-        texture = self._tree["textures"][_natural(info["index"])]
+        texture = self._item("textures", info["index"])
         webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
         index = webp.get("source", texture.get("source"))
         if index is None:
@@ -322,7 +320,7 @@ class _File:
                 "a texture is in a format that is not read; its faces are in plain colour",
             )
             return None
-        image = self._tree["images"][_natural(index)]
+        image = self._item("images", index)
         name = str(image.get("name", f"number {index}"))
         if "bufferView" in image:
             view = _natural(image["bufferView"])
@@ -332,54 +330,56 @@ class _File:
             return self._source.texture(("image", index), lambda: _data_of(uri), name)
         return self._source.texture_file(urllib.parse.unquote(uri))
 
-    def _accessor(self, index: Any, *, normalized: bool = False, as_stored: bool = False) -> Array:
-        """(count, width) values of an accessor as float64; integers that stand for fractions are
-        divided."""
-        accessor = self._tree["accessors"][_natural(index)]
-        kind = np.dtype(_TYPES[accessor["componentType"]])
-        width = _WIDTHS[accessor["type"]]
-        stored = self._stored(accessor, kind, width, accessor["count"])
-        if "sparse" in accessor:
-            stored = self._with_exceptions(stored, accessor["sparse"])
-        if as_stored:
-            return stored
+    def _accessor(self, index: Any, *, normalized: bool = False) -> Floats:
+        """(count, width) values of an accessor; integers that stand for fractions are divided."""
+        stored = self._stored(index)
         values = stored.astype(np.float64)
-        if kind.kind != "f" and (normalized or accessor.get("normalized")):
-            values = np.maximum(values / np.iinfo(kind).max, -1.0)
+        is_fraction = normalized or self._item("accessors", index).get("normalized")
+        if is_fraction and stored.dtype.kind != "f":
+            values = np.maximum(values / np.iinfo(stored.dtype).max, -1.0)
         return values
 
-    def _stored(self, place: Fields, kind: np.dtype[Any], width: int, count: int) -> Array:
-        """(count, width) values at the ``place`` in a view that an accessor, or a part of one,
-        names; zeros where it names none."""
-        if "bufferView" not in place:
-            return np.zeros((count, width), kind)
-        view = self._tree["bufferViews"][_natural(place["bufferView"])]
-        data = self._view(place["bufferView"])
-        start = _natural(place.get("byteOffset", 0))
-        size = width * kind.itemsize
-        stride = _natural(view.get("byteStride", 0)) or size
-        if count and start + stride * (count - 1) + size > len(data):
-            raise ValueError("an accessor is longer than its data; the file ends too early")
-        return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
-
-    def _with_exceptions(self, stored: Array, sparse: Fields) -> Array:
-        """Values of a sparse accessor: those stored, but for some, which are named one by one."""
+    def _stored(self, index: Any) -> Array:
+        """(count, width) values of an accessor as they are stored: those of its view, or zeros, but
+        for some that it names one by one."""
+        accessor = self._item("accessors", index)
+        kind = np.dtype(_TYPES[accessor["componentType"]])
+        shape = (accessor["count"], _WIDTHS[accessor["type"]])
+        stored = np.zeros(shape, kind)
+        if "bufferView" in accessor:
+            stored = self._viewed(accessor, kind, shape)
+        if "sparse" not in accessor:
+            return stored
+        sparse = accessor["sparse"]
         count = _natural(sparse["count"])
         if count > len(stored):
             raise ValueError("a sparse accessor names more values than it has")
-        places = sparse["indices"]
-        if "bufferView" not in places or "bufferView" not in sparse["values"]:
-            raise ValueError("a sparse accessor has no data")
-        kind = np.dtype(_TYPES[places["componentType"]])
-        index = self._stored(places, kind, 1, count)[:, 0].astype(np.int64)
-        if count and not 0 <= index.min() <= index.max() < len(stored):
+        index_kind = np.dtype(_TYPES[sparse["indices"]["componentType"]])
+        places = self._viewed(sparse["indices"], index_kind, (count, 1))[:, 0].astype(np.int64)
+        values = self._viewed(sparse["values"], kind, (count, shape[1]))
+        if count and not 0 <= places.min() <= places.max() < len(stored):
             raise ValueError("a sparse accessor names a value that it does not have")
-        values = stored.copy()
-        values[index] = self._stored(sparse["values"], stored.dtype, stored.shape[1], count)
-        return values
+        stored = stored.copy()
+        stored[places] = values
+        return stored
+
+    def _viewed(self, place: Fields, kind: np.dtype[Any], shape: tuple[int, int]) -> Array:
+        """(count, width) values at the ``place`` in a view that an accessor, or a part of one,
+        names."""
+        if "bufferView" not in place:
+            raise ValueError("a sparse accessor has no data")
+        data = self._view(place["bufferView"])
+        start = _natural(place.get("byteOffset", 0))
+        size = shape[1] * kind.itemsize
+        stride = (
+            _natural(self._item("bufferViews", place["bufferView"]).get("byteStride", 0)) or size
+        )
+        if shape[0] and start + stride * (shape[0] - 1) + size > len(data):
+            raise ValueError("an accessor is longer than its data; the file ends too early")
+        return np.ndarray(shape, kind, data, start, (stride, kind.itemsize))
 
     def _view(self, index: Any) -> memoryview:
-        view = self._tree["bufferViews"][_natural(index)]
+        view = self._item("bufferViews", index)
         buffer = self._buffer(_natural(view["buffer"]))
         start = _natural(view.get("byteOffset", 0))
         end = start + view["byteLength"]
@@ -389,12 +389,11 @@ class _File:
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._buffers:
-            buffer = self._tree["buffers"][index]
-            uri = buffer.get("uri")
-            if uri is not None and str(uri).startswith("data:"):
-                self._buffers[index] = _data_of(str(uri))
-            elif uri is not None:
-                self._buffers[index] = self._source.read(urllib.parse.unquote(str(uri)))
+            uri = str(self._tree["buffers"][index].get("uri") or "")
+            if uri.startswith("data:"):
+                self._buffers[index] = _data_of(uri)
+            elif uri:
+                self._buffers[index] = self._source.read(urllib.parse.unquote(uri))
             elif index == 0 and self._binary is not None:
                 self._buffers[index] = self._binary
             else:
@@ -405,11 +404,11 @@ class _File:
 def _local(node: Fields) -> Floats:
     """(4, 4) place of a node below its parent."""
     if "matrix" in node:
-        return as_plain_numbers(node["matrix"], 16, ()).reshape(4, 4).T
-    x, y, z, w = as_plain_numbers(node.get("rotation"), 4, (0.0, 0.0, 0.0, 1.0))
+        return fixed_numbers(node["matrix"], 16).reshape(4, 4).T
+    x, y, z, w = fixed_numbers(node.get("rotation"), 4, (0.0, 0.0, 0.0, 1.0))
     T = np.asarray(quaternion_matrix((w, x, y, z)))
-    T[:3, :3] *= as_plain_numbers(node.get("scale"), 3, (1.0, 1.0, 1.0))
-    T[:3, 3] = as_plain_numbers(node.get("translation"), 3, (0.0, 0.0, 0.0))
+    T[:3, :3] *= fixed_numbers(node.get("scale"), 3, (1.0, 1.0, 1.0))
+    T[:3, 3] = fixed_numbers(node.get("translation"), 3, (0.0, 0.0, 0.0))
     return T
 
 
@@ -417,11 +416,10 @@ def _faces(indices: Integers, mode: int) -> Integers:
     """(F, 3) faces of triangles, of a strip, whose every second one is turned over, or of a fan."""
     if mode == _TRIANGLES:
         return indices[: len(indices) // 3 * 3].reshape(-1, 3)
-    first = indices[:-2]
+    faces = np.column_stack([indices[:-2], indices[1:-1], indices[2:]])
     if mode == _FAN:
-        first = np.repeat(indices[:1], len(first))
-    faces = np.column_stack([first, indices[1:-1], indices[2:]])
-    if mode == _STRIP:
+        faces[:, 0] = indices[:1]
+    else:
         faces[1::2] = faces[1::2, ::-1]
     return faces
 
@@ -431,7 +429,7 @@ def _base_colour(material: Fields) -> tuple[Floats, Fields | None]:
     specular = material.get("extensions", {}).get(_SPECULAR)
     metallic = material.get("pbrMetallicRoughness", {})
     kind, values = ("baseColor", metallic) if specular is None else ("diffuse", specular)
-    factor = as_plain_numbers(values.get(f"{kind}Factor"), 4, (1.0,) * 4)
+    factor = fixed_numbers(values.get(f"{kind}Factor"), 4, (1.0,) * 4)
     return factor[:3], values.get(f"{kind}Texture")
 
 

@@ -6,23 +6,19 @@ scripts/upstream, several libraries, and options of textures, this reader can go
 """
 
 import re
+from array import array
 from dataclasses import dataclass, field
 from itertools import takewhile
 
 import numpy as np
 
 from ...utils.arrays import Bytes, Floats, Integers
-from .colours import Painting, SurfaceColours, byte_colours
-from .limits import check_faces, check_lines, check_parts
-from .polygons import triangles_of_faces
+from .colours import SurfaceColours, byte_colours
+from .limits import check_corners, check_lines, check_parts
+from .polygons import triangulated
 from .source import MeshSource, ReadMesh, colour_bytes, numbers, plain_text, spellings
 
 CHUNK = 100_000  # Lines of faces that are read at once, which bounds the memory
-# Corners of one form: v, v/vt and v/vt/vn. Possessive, so that no text takes long to be refused.
-_FORMS = {
-    fields: re.compile(rb"(?:\s++" + rb"/".join([rb"-?+\d++"] * fields) + rb")++\s*+")
-    for fields in (1, 2, 3)
-}
 _NAMES = (b"usemtl", b"o", b"g", b"mtllib")
 _NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 # Options of a texture in an MTL file, and how many words follow; 0: up to three numbers
@@ -37,7 +33,7 @@ class _Material:
     """One material: its colour in [0, 1], if any, and its texture with scale and offset of the
     coordinates."""
 
-    colour: tuple[float, ...] | None = None
+    colour: list[float] | None = None
     texture: bytes | None = None
     scale: tuple[float, float] = (1.0, 1.0)
     offset: tuple[float, float] = (0.0, 0.0)
@@ -49,20 +45,33 @@ class _Lines:
 
     Attributes:
         points, uv, faces: what follows the key.
-        points_before, uv_before: vertices and texture coordinates above each face.
-        material: number of the material of each face, -1 for none.
+        above: of each face the numbers of points and of texture coordinates above it, and that of
+            its material, -1 for none.
         materials: names and their numbers.
         libraries: what follows each ``mtllib``.
+        parts: names of objects and groups.
+        material: the number of the last ``usemtl``.
     """
 
     points: list[bytes] = field(default_factory=list)
     uv: list[bytes] = field(default_factory=list)
     faces: list[bytes] = field(default_factory=list)
-    points_before: list[int] = field(default_factory=list)
-    uv_before: list[int] = field(default_factory=list)
-    material: list[int] = field(default_factory=list)
+    above: "array[int]" = field(default_factory=lambda: array("q"))
     materials: dict[bytes, int] = field(default_factory=dict)
     libraries: dict[bytes, None] = field(default_factory=dict)
+    parts: set[bytes] = field(default_factory=set)
+    material: int = -1
+
+    def note(self, key: bytes, name: bytes) -> None:
+        """Note the name of a material, part or library."""
+        if key == b"usemtl":
+            number = len(self.materials)
+            self.material = self.materials.setdefault(name, number) if name else -1
+        elif key == b"mtllib":
+            self.libraries[name] = None
+        else:
+            self.parts.add(name)
+        check_parts(max(len(self.parts), len(self.materials), len(self.libraries)))
 
 
 def read_obj(source: MeshSource) -> ReadMesh:
@@ -72,11 +81,11 @@ def read_obj(source: MeshSource) -> ReadMesh:
     check_lines(data)
     lines = _lines_of(data)
     points, point_colours = _points(lines.points)
-    corners, counts = _corners(lines)
-    face_of, picked = _triangles(points, corners, counts)
-    faces = corners[picked, 0]
-    material = np.array(lines.material, np.int64)[face_of]
-    colours = _colours(source, lines, material, faces, corners[picked, 1], point_colours)
+    above = np.array(lines.above, np.int64).reshape(-1, 3)
+    corners, counts = _corners(lines, above[:, :2])
+    picked, face_of = triangulated(points, corners[:, 0], counts)
+    faces, uv_index = np.moveaxis(corners[picked], -1, 0)
+    colours = _colours(source, lines, above[face_of, 2], faces, uv_index, point_colours)
     return ReadMesh(points, faces, colours)
 
 
@@ -84,68 +93,37 @@ def _lines_of(data: bytes) -> _Lines:
     if b"\\\n" in data:
         data = data.replace(b"\\\n", b" ")
     found = _Lines()
-    current = -1
-    parts: set[bytes] = set()
     points = found.points
-    faces = found.faces
-    uv = found.uv
     has_remarks = b"#" in data
     for line in data.split(b"\n"):
-        start = line[:2]  # most lines, without a search for their words
-        if start == b"v " and not has_remarks:
+        if line[:2] == b"v " and not has_remarks:  # most lines, without a search for their words
             points.append(line[2:])
             continue
-        words = line.split(None, 1)
-        if not words:
-            continue
-        key = words[0]
-        rest = words[1].partition(b"#")[0] if len(words) > 1 else b""
+        key, whole = [*line.split(None, 1), b"", b""][:2]
+        rest = whole.partition(b"#")[0]
         if key == b"v":
             points.append(rest)
         elif key == b"f":
-            faces.append(rest)
-            found.points_before.append(len(points))
-            found.uv_before.append(len(uv))
-            found.material.append(current)
+            found.faces.append(rest)
+            found.above.extend((len(points), len(found.uv), found.material))
         elif key == b"vt":
-            uv.append(rest)
+            found.uv.append(rest)
         elif key in _NAMES:
-            name = words[1] if key == b"mtllib" and len(words) > 1 else rest
-            current = _noted(found, parts, key, name.strip(), current)
+            found.note(key, (whole if key == b"mtllib" else rest).strip())
     return found
 
 
-def _noted(found: _Lines, parts: set[bytes], key: bytes, name: bytes, current: int) -> int:
-    """Note the name of a material, part or library; returns the number of the material that now
-    holds."""
-    if key == b"usemtl":
-        current = found.materials.setdefault(name, len(found.materials)) if name else -1
-    elif key == b"mtllib":
-        found.libraries[name] = None
-    else:
-        parts.add(name)
-    check_parts(max(len(parts), len(found.materials), len(found.libraries)))
-    return current
-
-
-@dataclass
-class _Table:
-    """The numbers of some lines, and (N,) how many each line has, and where its first one is."""
-
-    values: Floats
-    counts: Integers
-
-    @property
-    def first(self) -> Integers:
-        return np.cumsum(self.counts) - self.counts
-
-
-def _table(lines: list[bytes], least: int, what: str) -> _Table:
-    """The numbers of some lines, of which each has at least ``least``."""
+def _table(lines: list[bytes], least: int, most: int, what: str) -> tuple[Floats, Integers]:
+    """(N, most) the first numbers of some lines, 0 for those that a line lacks, and (N,) how many
+    it has, which must be at least ``least``."""
     counts = _word_counts(lines)
     if counts.min(initial=least) < least:
         raise ValueError(f"{what} has fewer than {least} coordinates")
-    return _Table(numbers(b"\n".join(lines)), counts)
+    values = np.append(numbers(b"\n".join(lines)), np.zeros(most))
+    columns = np.arange(most)
+    table = values[(np.cumsum(counts) - counts)[:, None] + columns]
+    table[columns >= counts[:, None]] = 0.0
+    return table, counts
 
 
 def _word_counts(lines: list[bytes]) -> Integers:
@@ -154,64 +132,43 @@ def _word_counts(lines: list[bytes]) -> Integers:
 
 def _points(lines: list[bytes]) -> tuple[Floats, Bytes | None]:
     """(V, 3) coordinates, and (V, 3) colours if any line has some; the others are white."""
-    table = _table(lines, 3, "a vertex")
-    first = table.first
-    points = table.values[first[:, None] + np.arange(3)]
-    weighted = (table.counts == 4).nonzero()[0]
-    if len(weighted):
-        weight = table.values[first[weighted] + 3]
-        points[weighted] /= np.where(weight == 0.0, 1.0, weight)[:, None]
-    coloured = (table.counts >= 6).nonzero()[0]
-    if not len(coloured):
+    table, counts = _table(lines, 3, 6, "a vertex")
+    points = table[:, :3].copy()
+    weighted = (counts == 4) & (table[:, 3] != 0.0)
+    points[weighted] /= table[weighted, 3:4]
+    coloured = counts >= 6
+    if not coloured.any():
         return points, None
     colours = np.full((len(points), 3), 255, np.uint8)
-    colours[coloured] = colour_bytes(table.values[first[coloured][:, None] + np.arange(3, 6)])
+    colours[coloured] = colour_bytes(table[coloured, 3:])
     return points, colours
 
 
-def _corners(lines: _Lines) -> tuple[Integers, Integers]:
+def _corners(lines: _Lines, above: Integers) -> tuple[Integers, Integers]:
     """(N, 2) vertex and texture coordinate (-1: none) of the corners of all faces, counted from 0,
     and (F,) how many corners each face has."""
     counts = _word_counts(lines.faces)
-    check_faces(np.maximum(counts - 2, 0).sum())
     chunks = [_indices(lines.faces[k : k + CHUNK]) for k in range(0, len(lines.faces), CHUNK)]
     indices = np.concatenate([np.zeros((0, 2), np.int64), *chunks])
-    before = np.column_stack([lines.points_before, lines.uv_before]).reshape(-1, 2)
-    before = np.repeat(before, counts, axis=0)
     if (indices[:, 0] == 0).any():
         raise ValueError("a face names vertex 0; OBJ files count from 1")
     # 0, for no texture coordinate, becomes -1
-    corners = np.where(indices < 0, before + indices, indices - 1)
-    known = np.array([len(lines.points), len(lines.uv)])
-    if (corners[:, 0] < 0).any() or (corners >= known).any() or (corners[:, 1] < -1).any():
-        raise IndexError
+    corners = np.where(indices < 0, np.repeat(above, counts, axis=0) + indices, indices - 1)
+    check_corners(corners[:, 1] + 1, len(lines.uv) + 1)
     return corners, counts
 
 
 def _indices(lines: list[bytes]) -> Integers:
     """(N, 2) indices of vertices and texture coordinates as written, 0 for none."""
-    text = b" " + b"\n ".join(lines)
-    text = text.replace(b"//", b"/0/")
-    for fields, form in _FORMS.items():
-        if form.fullmatch(text):
-            values = np.fromstring(text.replace(b"/", b" ").decode(), dtype=np.int64, sep=" ")
-            table = values.reshape(-1, fields)
-            return table[:, :2] if fields > 1 else np.column_stack([table, np.zeros_like(table)])
-    rows = [[*corner.split(b"/"), b""][:2] for corner in text.split()]
-    return np.array([[int(v), int(vt or 0)] for v, vt in rows], np.int64).reshape(-1, 2)
-
-
-def _triangles(points: Floats, corners: Integers, counts: Integers) -> tuple[Integers, Integers]:
-    """(T,) the faces of the triangles, and (T, 3) their corners."""
-    first = np.cumsum(counts) - counts
-    simple = (counts == 3).nonzero()[0]
-    many = (counts > 3).nonzero()[0]
-    polygons = [corners[first[k] : first[k] + counts[k], 0].tolist() for k in many]
-    _, owner, places = triangles_of_faces(points, polygons)
-    face_of = np.concatenate([simple, many[owner]])
-    places = np.concatenate([np.tile(np.arange(3), (len(simple), 1)), places])
-    order = np.argsort(face_of, kind="stable")
-    return face_of[order], (first[face_of][:, None] + places)[order]
+    corners = b" ".join(lines).replace(b"//", b"/0/").split()
+    fields = 1 + max((corner.count(b"/") for corner in corners), default=0)
+    words = b" ".join(corners).replace(b"/", b" ").split()
+    if len(words) < fields * len(corners):  # some corners have fewer fields than others
+        pairs = [[*corner.split(b"/"), b""][:2] for corner in corners]
+        words = [word or b"0" for pair in pairs for word in pair]
+        fields = 2
+    table = np.array(words, np.int64).reshape(-1, fields)
+    return np.pad(table, ((0, 0), (0, 1)))[:, :2]
 
 
 def _colours(
@@ -230,31 +187,27 @@ def _colours(
         source.warn("material", text)
     if point_colours is None and len(lost) == len(lines.materials):
         return None
-    painting = Painting(len(faces))
+    painted = SurfaceColours.plain(len(faces))
     if point_colours is not None:
-        painting.corners = point_colours[faces]
-    table = _table(lines.uv, 1, "a texture coordinate")
-    u = table.values[table.first]
+        painted.corners[:] = point_colours[faces]
     # a texture of one dimension has no v
-    v = np.where(table.counts < 2, 0.0, np.append(table.values, 0.0)[table.first + 1])
-    coordinates = np.nan_to_num(np.column_stack([u, v]), posinf=0.0, neginf=0.0)
+    coordinates, _ = _table(lines.uv, 1, 2, "a texture coordinate")
     has_uv = (uv_index >= 0).all(axis=1)
     order = np.argsort(material, kind="stable")
-    starts = np.searchsorted(material[order], np.arange(len(lines.materials) + 1))
-    for name, number in lines.materials.items():
+    starts = np.searchsorted(material[order], np.arange(len(lines.materials)))
+    for name, own in zip(lines.materials, np.split(order, starts)[1:], strict=True):
         found = library.get(name)
-        own = order[starts[number] : starts[number + 1]]
         if found is None or not len(own):
             continue
         if point_colours is None and found.colour is not None:
-            painting.corners[own] = byte_colours(found.colour)
+            painted.corners[own] = byte_colours(found.colour)
         texture = None if found.texture is None else source.texture_file(*spellings(found.texture))
         if texture is not None:
             own = own[np.take(has_uv, own)]
-            painting.corners[own] = 255  # beside a texture, exporters write any colour
-            uv = coordinates[uv_index[own]] * found.scale + found.offset
-            painting.add_texture(own, texture, uv)
-    return painting.finished()
+            painted.corners[own] = 255  # beside a texture, exporters write any colour
+            uv = np.nan_to_num(coordinates[uv_index[own]], posinf=0.0, neginf=0.0)
+            painted = painted.with_texture(own, texture, uv * found.scale + found.offset)
+    return painted
 
 
 def _libraries(source: MeshSource, statements: list[bytes]) -> dict[bytes, _Material]:
@@ -277,27 +230,22 @@ def _materials(data: bytes) -> dict[bytes, _Material]:
     found: dict[bytes, _Material] = {}
     current = _Material()
     for line in data.split(b"\n"):
-        words = line.split(None, 1)
-        if not words or words[0].startswith(b"#"):
-            continue
-        key = words[0].lower()
-        rest = words[1].strip() if len(words) > 1 else b""
+        word, rest = [*line.split(None, 1), b"", b""][:2]
+        key = word.lower()
         if key == b"newmtl":
-            current = found.setdefault(rest, _Material())
+            current = found.setdefault(rest.strip(), _Material())
         elif key == b"kd":
-            current.colour = _colour(rest)
+            # one grey value or three colours; none of spectral curves and CIEXYZ
+            values = _leading_numbers(rest)
+            current.colour = values if len(values) == 3 else values[:1] * 3 or None
         elif key == b"map_kd":
-            _set_texture(current, rest)
+            _set_texture(current, rest.strip())
     return found
 
 
-def _colour(text: bytes) -> tuple[float, ...] | None:
-    """One grey value or three colours; None for spectral curves and CIEXYZ."""
-    words = text.split()[:3]
-    if not words or not all(_NUMBER.fullmatch(word) for word in words):
-        return None
-    values = [float(word) for word in words]
-    return tuple(values) if len(values) == 3 else (values[0],) * 3
+def _leading_numbers(text: bytes) -> list[float]:
+    """Up to three numbers that a text begins with."""
+    return [*map(float, takewhile(_NUMBER.fullmatch, text.split(None, 3)[:3]))]
 
 
 def _set_texture(material: _Material, text: bytes) -> None:
@@ -307,12 +255,11 @@ def _set_texture(material: _Material, text: bytes) -> None:
         option = word.lower()
         if option not in _MAP_OPTIONS:
             break
-        numeric = [*map(float, takewhile(_NUMBER.fullmatch, rest.split(None, 3)[:3]))]
-        count = _MAP_OPTIONS[option] or len(numeric)
-        if option == b"-s" and numeric:
-            material.scale = numeric[0], [*numeric, 1.0][1]
-        elif option == b"-o" and numeric:
-            material.offset = numeric[0], [*numeric, 0.0][1]
-        pieces = rest.split(None, count)
-        text = pieces[count] if len(pieces) > count else b""
+        values = _leading_numbers(rest)
+        count = _MAP_OPTIONS[option] or len(values)
+        if option == b"-s" and values:
+            material.scale = values[0], [*values, 1.0][1]
+        elif option == b"-o" and values:
+            material.offset = values[0], [*values, 0.0][1]
+        text = b"".join(rest.split(None, count)[count:])
     material.texture = text.strip().strip(b'"') or None

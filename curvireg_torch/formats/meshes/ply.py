@@ -9,16 +9,16 @@ go.
 import re
 from collections.abc import Sequence
 from io import BytesIO
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
 
 from ...utils.aliases import Fields
-from ...utils.arrays import Array, Bytes, Floats, Integers
-from .colours import Painting, SurfaceColours
+from ...utils.arrays import Bytes, Floats, Integers
+from .colours import SurfaceColours
 from .limits import check_lines
-from .polygons import triangles_of_faces
+from .polygons import triangulated
 from .source import MeshSource, ReadMesh, colour_bytes, spellings
 
 MAX_COLUMNS = 500  # Properties in a header, whose number squared bounds the time
@@ -62,25 +62,23 @@ def read_ply(source: MeshSource) -> ReadMesh:
     raw = trimesh.exchange.ply.load_ply(
         BytesIO(plain + end + body), skip_materials=True, fix_texture=False
     )
-    elements: dict[str, Fields] = raw["metadata"]["_ply_raw"]
-    for name, element in elements.items():
-        values = element.get("data")
-        rows = list(values.values()) if isinstance(values, dict) else [values]
-        if element["length"] and any(row is None or len(row) < element["length"] for row in rows):
-            raise ValueError(f"the file ends before the last {name}")
-    points = _Element(elements.get("vertex", {}))
-    polygons = _Element(elements.get("face", {}))
-    if not points.names:
+    kinds = {name: _Rows(name, rows) for name, rows in raw["metadata"]["_ply_raw"].items()}
+    points = kinds.get("vertex", _Rows())
+    polygons = kinds.get("face", _Rows())
+    if not points.columns:
         return ReadMesh.joined([])
     vertices = points.table(("x", "y", "z"))
     if vertices is None:
         raise ValueError("its vertices have no x, y and z")
-    if not polygons.names and "tristrips" in elements:
+    if not polygons.columns and "tristrips" in kinds:
         raise ValueError("its faces are strips of triangles, which are not read; export triangles")
-    if not polygons.names:
+    if not polygons.columns:
         return ReadMesh(vertices, np.zeros((0, 3), np.int64))
-    name = next((name for name in _FACE_LISTS if name in polygons.names), polygons.names[0])
-    faces = _Faces(*_divided(vertices, polygons.lists(name)))
+    name = next(filter(polygons.columns.__contains__, [*_FACE_LISTS, *polygons.columns]))
+    values, counts = polygons.lists(name)
+    corners = values.astype(np.int64)
+    picked, owner = triangulated(vertices, corners, counts)
+    faces = _Faces(corners[picked], owner, picked, counts)
     return ReadMesh(vertices, faces.vertices, _colours(source, points, polygons, names, faces))
 
 
@@ -98,30 +96,33 @@ def _check_last_line(header: bytes, body: bytes) -> None:
 
 
 class _Faces(NamedTuple):
-    """(T, 3) vertices of triangles, (T,) the polygons that they are of, and (T, 3) which corners of
-    these they have."""
+    """(T, 3) vertices of triangles, (T,) the polygons that they are of, (T, 3) which corners of all
+    polygons they have; and (P,) how many corners each polygon has."""
 
     vertices: Integers
     owner: Integers
-    places: Integers
+    corners: Integers
+    counts: Integers
 
 
-class _Element:
-    """One kind of rows of the file: its columns by name."""
+class _Rows:
+    """One kind of rows of the file, as trimesh has parsed it: its columns by name."""
 
-    def __init__(self, element: Fields) -> None:
-        self._data = element.get("data")
-        self.names: list[str] = []
-        if isinstance(self._data, dict):
-            self.names = list(self._data)
-        elif self._data is not None:
-            self.names = list(self._data.dtype.names)
+    def __init__(self, name: str = "", parsed: Fields | None = None) -> None:
+        parsed = parsed or {"length": 0}
+        data = parsed.get("data")
+        self._length: int = parsed["length"]
+        self.columns: Fields = data if isinstance(data, dict) else {}
+        if isinstance(data, np.ndarray):
+            self.columns = {key: data[key] for key in data.dtype.names}
+        if min(map(len, self.columns.values()), default=0) < self._length:
+            raise ValueError(f"the file ends before the last {name}")
 
     def table(self, names: Sequence[str]) -> Floats | None:
         """(N, K) values of some columns, None if one is absent."""
-        if self._data is None or not set(names) <= set(self.names):
+        if not set(names) <= self.columns.keys():
             return None
-        columns = [np.asarray(self._data[name], np.float64).reshape(-1) for name in names]
+        columns = [np.asarray(self.columns[name], np.float64).reshape(-1) for name in names]
         return np.column_stack(columns)
 
     def colours(self) -> Bytes | None:
@@ -129,9 +130,9 @@ class _Element:
         and those of 16 bits are scaled if they need more than 8."""
         for names in _COLOURS:
             values = self.table(names)
-            if values is None or self._data is None:
+            if values is None:
                 continue
-            stored = np.asarray(self._data[names[0]]).dtype
+            stored = np.asarray(self.columns[names[0]]).dtype
             if stored.kind == "f":
                 return colour_bytes(values)
             is_large = stored == np.uint16 and values.max(initial=0.0) > 255
@@ -139,34 +140,27 @@ class _Element:
             return np.clip(np.nan_to_num(factor * values).round(), 0, 255).astype(np.uint8)
         return None
 
-    def lists(self, name: str) -> Any:
-        """(N, n) values of a column of lists, or N arrays of several lengths."""
-        if self._data is None:
-            return []
-        values = self._data[name]
-        if isinstance(self._data, dict):
-            return values
-        # trimesh takes the first face's number of corners for that of all
-        if (values["f0"] != values["f1"].shape[1]).any():
-            raise ValueError(
-                "binary faces with different numbers of corners are not read; export triangles"
-            )
-        return values["f1"]
-
-
-def _divided(vertices: Floats, lists: Any) -> tuple[Integers, Integers, Integers]:
-    """The parts of :class:`_Faces`."""
-    if np.shape(lists)[1:] == (3,):
-        faces = np.asarray(lists).astype(np.int64)
-        return faces, np.arange(len(faces)), np.broadcast_to(np.arange(3), faces.shape)
-    return triangles_of_faces(vertices, [row.tolist() for row in lists])
+    def lists(self, name: str) -> tuple[Floats, Integers]:
+        """The values of a column of lists, one list after the other, and (N,) their lengths."""
+        rows = self.columns[name]
+        if rows.dtype.names is not None:
+            # trimesh takes the first face's number of corners for that of all
+            if (rows["f0"] != rows["f1"].shape[1]).any():
+                raise ValueError(
+                    "binary faces with different numbers of corners are not read; export triangles"
+                )
+            rows = rows["f1"]
+        if rows.dtype == object:
+            return np.concatenate([np.zeros(0), *rows]), np.array([*map(len, rows)], np.int64)
+        rows = rows.reshape(self._length, -1)  # of one row, trimesh leaves out an axis
+        return rows.reshape(-1), np.full(len(rows), rows.shape[1])
 
 
 def _colours(
-    source: MeshSource, points: _Element, polygons: _Element, names: list[bytes], faces: _Faces
+    source: MeshSource, points: _Rows, polygons: _Rows, names: list[bytes], faces: _Faces
 ) -> SurfaceColours | None:
     """Textures first, then colours of faces, then of vertices."""
-    painting = Painting(len(faces.vertices))
+    painted = SurfaceColours.plain(len(faces.vertices))
     uv = _coordinates(points, polygons, faces) if names else None
     if uv is not None:
         number = polygons.table(["texnumber"])
@@ -176,14 +170,14 @@ def _colours(
                 f"it names {len(names)} textures and does not say which face has which; the first "
                 "is used",
             )
-        texture = np.zeros(len(uv)) if number is None else number[faces.owner, 0].astype(np.int64)
+        texture = np.zeros(len(uv)) if number is None else number[faces.owner, 0]
         pixels = [source.texture_file(*spellings(name)) for name in names]
         for index, picture in enumerate(pixels):
             own = texture == index
             if picture is not None:
-                painting.add_texture(own, picture, uv[own])
-        if any(picture is not None for picture in pixels):
-            return painting.finished()
+                painted = painted.with_texture(own, picture, uv[own])
+        if painted.textures:
+            return painted
     elif names:
         source.warn(
             "texture",
@@ -192,23 +186,20 @@ def _colours(
     of_faces = polygons.colours()
     of_points = points.colours()
     if of_faces is not None:
-        painting.corners[:] = of_faces[faces.owner][:, None]
+        painted.corners[:] = of_faces[faces.owner][:, None]
     elif of_points is not None:
-        painting.corners = of_points[faces.vertices]
+        painted.corners[:] = of_points[faces.vertices]
     else:
         return None
-    return painting.finished()
+    return painted
 
 
-def _coordinates(points: _Element, polygons: _Element, faces: _Faces) -> Array | None:
+def _coordinates(points: _Rows, polygons: _Rows, faces: _Faces) -> Floats | None:
     """(T, 3, 2) texture coordinates, of the faces' corners or of the vertices."""
-    if _OWN_CORNERS not in polygons.names:
+    if _OWN_CORNERS not in polygons.columns:
         tables = [points.table(names) for names in _COORDINATES]
         return next((table[faces.vertices] for table in tables if table is not None), None)
-    rows = polygons.lists(_OWN_CORNERS)
-    starts = np.cumsum([0, *map(len, rows)])
-    values = np.concatenate([np.zeros(0), *rows])
-    at = starts[:-1][faces.owner][:, None] + 2 * faces.places
-    if (at + 2 > starts[1:][faces.owner][:, None]).any():
+    values, counts = polygons.lists(_OWN_CORNERS)
+    if (counts != 2 * faces.counts).any():
         raise ValueError("texture coordinates that do not fit the faces")
-    return np.stack([values[at], values[at + 1]], axis=-1)
+    return values.reshape(-1, 2)[faces.corners]

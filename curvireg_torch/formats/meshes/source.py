@@ -2,11 +2,10 @@
 warnings."""
 
 import os
-import warnings
 from collections.abc import Callable, Iterable, Sequence, Sized
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TEXTURE_PIXELS
 from ...utils.arrays import Bytes, Floats, Integers
 from ...utils.choices import UNITS
 from .colours import SurfaceColours, texture_pixels
+from .limits import check_corners
 
 MOST_WARNINGS = 5  # Of one kind
 # Bytes and parts of a file's name, and bytes of each part: no longer one is that of a file
@@ -64,11 +64,15 @@ class ReadMesh:
     usual_unit: str | None = None
     warnings: tuple[MeshWarning, ...] = ()
 
+    @classmethod
+    def of_surface(cls, mesh: Any, colours: SurfaceColours | None = None) -> "ReadMesh":
+        """The triangles of a ``trimesh.Trimesh``."""
+        return cls(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64), colours)
+
     def without_unused_vertices(self) -> "ReadMesh":
         """The same faces without the vertices that none of them names, so that copies stay in
         proportion to the faces, which are counted."""
-        if self.faces.min(initial=0) < 0:
-            raise IndexError
+        check_corners(self.faces, len(self.vertices))
         is_used = np.zeros(len(self.vertices), bool)
         is_used[self.faces] = True
         if is_used.all():
@@ -162,17 +166,17 @@ class MeshSource:
 
     def has(self, name: str) -> bool:
         """Whether a name is that of a file that may be read, which is not thereby requested."""
-        return any(self._existing(place) is not None for place in self._places(name))
+        return any(map(self._existing, self._places(name)))
 
     def find(self, name: str) -> Path | None:
         """The file that a mesh names; None if it lies outside of the folders. It may not exist."""
-        inside = self._places(name)
-        if not inside:
+        places = self._places(name)
+        if not places:
             return None
-        found = next((file for file in map(self._existing, inside) if file is not None), None)
-        self.requested.add(found or inside[0])
+        found = next(filter(None, map(self._existing, places)), places[0])
+        self.requested.add(found)
         _check_names(self.requested)
-        return found or inside[0]
+        return found
 
     def _places(self, name: str) -> list[Path]:
         """Where in the folders a file of a name may be, existing or not; each name is looked for
@@ -183,17 +187,19 @@ class MeshSource:
         return self._known_places[name]
 
     def _places_of(self, name: str) -> list[Path]:
-        relative = self._relative_name(name)
-        if relative is None:
+        """Backslashes separate folders too, and of absolute names the last part counts."""
+        if "://" in name or not is_file_name(name):
             return []
-        beside = (self.folder / relative).resolve()
-        inside = [beside] if beside.is_relative_to(self.folder) else []
+        relative = name.replace("\\", "/")
+        last = relative.rpartition("/")[2]
+        if relative.startswith("/") or ":" in relative.partition("/")[0]:
+            relative = last
+        beside = self.folder / relative
+        places = [(beside, self.folder)]
         for folder in self.extra:
-            places = [beside, (folder / relative).resolve(), (folder / relative.name).resolve()]
-            inside += [
-                place for place in places if place.is_relative_to(folder) and place not in inside
-            ]
-        return inside
+            places += [(path, folder) for path in (beside, folder / relative, folder / last)]
+        resolved = [(path.resolve(), folder) for path, folder in places]
+        return [path for path, folder in resolved if path.is_relative_to(folder)]
 
     def read(self, name: str) -> bytes:
         """The content of a file that the mesh needs; ValueError where it cannot be had."""
@@ -258,26 +264,14 @@ class MeshSource:
         if self._bytes_left < 0:
             raise ValueError(f"the files that it names hold more than {MAX_MESH_BYTES:,} bytes")
 
-    @staticmethod
-    def _relative_name(name: str) -> PurePosixPath | None:
-        """A name as a relative path: backslashes separate folders too, and of absolute names the
-        last part counts."""
-        if "://" in name or not is_file_name(name):
-            return None
-        path = PurePosixPath(name.replace("\\", "/"))
-        is_absolute = path.is_absolute() or ":" in path.parts[0]
-        return PurePosixPath(path.name) if is_absolute else path
-
     def _existing(self, path: Path) -> Path | None:
-        """The file itself, or one whose name differs in upper and lower case only."""
+        """The file itself at one of the places, or one whose name differs in upper and lower case
+        only."""
         if path.is_file():
             return path
         roots = [self.folder, *self.extra]
-        root = next((folder for folder in roots if path.is_relative_to(folder)), None)
-        if root is None:
-            return None
-        place = root
-        for part in path.relative_to(root).parts:
+        place = next(folder for folder in roots if path.is_relative_to(folder))
+        for part in path.relative_to(place).parts:
             name = self._names_in(place).get(part.lower())
             if name is None:
                 return None
@@ -341,32 +335,19 @@ def colour_bytes(colours: Floats) -> Bytes:
 
 def numbers(text: bytes) -> Floats:
     """Numbers between blanks; ValueError for anything else."""
-    count = len(text.split())
-    if b"," in text:
-        raise ValueError("decimal commas; export it with decimal points")
-    with warnings.catch_warnings():
-        # of what is no number, which is counted below
-        warnings.simplefilter("ignore", DeprecationWarning)
-        try:
-            values = np.fromstring(text.decode("latin-1"), dtype=np.float64, sep=" ")
-        except ValueError:  # how newer versions of numpy say it
-            values = np.zeros(0)
-    if len(values) != count:
-        raise ValueError("a coordinate is not a number")
-    return values
+    try:
+        return np.array(text.split(), np.float64)
+    except ValueError as error:
+        if b"," in text:
+            raise ValueError("decimal commas; export it with decimal points") from error
+        raise ValueError("a coordinate is not a number") from error
 
 
-def finite_words(text: str, count: int) -> Floats:
-    """``count`` finite numbers between blanks."""
-    values = np.array([float(word) for word in text.split()])
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise ValueError(f"expected {count} numbers, got {text[:50]!r}")
-    return values
-
-
-def as_plain_numbers(value: Any, count: int, default: Sequence[float]) -> Floats:
-    """(count,) numbers of JSON, or the default where None."""
-    values = np.asarray(default if value is None else value, dtype=np.float64)
-    if values.shape != (count,):
-        raise ValueError(f"expected {count} numbers, got {value!r}"[:200])
-    return values
+def fixed_numbers(values: Any, count: int, default: Sequence[float] = ()) -> Floats:
+    """(count,) finite numbers of a list, or between the blanks of a text; the default where
+    None."""
+    given = default if values is None else values
+    found = np.asarray(given.split() if isinstance(given, str) else given, np.float64)
+    if found.shape != (count,) or not np.isfinite(found).all():
+        raise ValueError(f"expected {count} numbers, got {values!r}"[:200])
+    return found

@@ -18,9 +18,9 @@ import numpy as np
 from ...errors import MAX_MESH_BYTES, MAX_MESH_FACES, MAX_MESH_PARTS
 from ...utils.arrays import Bytes, Floats
 from ..xml_files import check_xml
-from .colours import Painting, SurfaceColours
-from .limits import check_faces, check_parts
-from .source import MeshSource, ReadMesh, finite_words
+from .colours import SurfaceColours
+from .limits import check_corners, check_faces, check_parts
+from .source import MeshSource, ReadMesh, fixed_numbers
 
 _UNITS = {"millimeter": "mm", "centimeter": "cm", "inch": "in", "foot": "ft", "meter": "m"}
 _MICRON = "micron"
@@ -43,29 +43,49 @@ Attributes = dict[str, str]
 Item = tuple[str, str, str]
 """Path of a model part, the object in it, and its transform."""
 
+Property = tuple[str, int, int, int]
+"""A group of colours or texture coordinates, "" for none, and the entries of three corners."""
+
 
 @dataclass
 class _Object:
-    """One object of a model part: a mesh, or copies of other objects."""
+    """One object of a model part: a mesh, or copies of other objects.
 
-    group: str = ""
-    index: int = 0
+    Attributes:
+        plain: the property of triangles that have none of their own.
+        properties: of each triangle.
+    """
+
+    plain: Property = ("", 0, 0, 0)
     kind: str = "model"
     vertices: "array[float]" = field(default_factory=lambda: array("d"))
     triangles: "array[int]" = field(default_factory=lambda: array("q"))
-    properties: list[tuple[str, int, int, int] | None] = field(default_factory=list)
+    properties: list[Property] = field(default_factory=list)
     components: list[Item] = field(default_factory=list)
+
+    def add_triangle(self, given: Attributes) -> None:
+        """Add a triangle with its attributes."""
+        self.triangles.extend((int(given["v1"]), int(given["v2"]), int(given["v3"])))
+        own = self.plain
+        if "p1" in given:
+            a, b, c = (int(given.get(name, given["p1"])) for name in ("p1", "p2", "p3"))
+            own = given.get("pid", own[0]), a, b, c
+        self.properties.append(own)
 
 
 @dataclass
 class _Model:
-    """What one model part of the package holds."""
+    """What one model part of the package holds.
+
+    Attributes:
+        groups: colours, or texture coordinates, by the id of their group.
+        texture_of: ids of the textures of the latter, whose files are the ``paths``.
+    """
 
     unit: str = "millimeter"
     objects: dict[str, _Object] = field(default_factory=dict)
     items: list[Item] = field(default_factory=list)
-    colours: dict[str, list[tuple[int, int, int]]] = field(default_factory=dict)
-    coordinates: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    groups: dict[str, list[tuple[float, ...]]] = field(default_factory=dict)
     texture_of: dict[str, str] = field(default_factory=dict)
     paths: dict[str, str] = field(default_factory=dict)
     unread: set[str] = field(default_factory=set)
@@ -107,10 +127,10 @@ class _Package:
     def root(self) -> str:
         """The path of the model that the package starts with."""
         models = [name for name in self._names if name.endswith(".model")]
-        first = [name for name in models if _MODEL in name]
         if not models:
             raise ValueError("no model in it")
-        return "/" + min(first or models, key=lambda name: (name.count("/"), len(name), name))
+        order = [(_MODEL not in name, name.count("/"), len(name), name) for name in models]
+        return f"/{min(order)[-1]}"
 
     def model(self, path: str) -> _Model:
         """One model part of the package."""
@@ -126,14 +146,15 @@ class _Package:
         copies on the plate the first."""
         items: dict[tuple[str, str], Item] = {}
         copies = 0
-        for path, name, transform in self.model(root).items:
-            known = self.model(path or root).objects.get(name)
+        for given, name, transform in self.model(root).items:
+            path = given or root
+            known = self.model(path).objects.get(name)
             if known is not None and known.kind in _SUPPORTS:
                 self._source.warn("parts", "supports of the print are left out")
-            elif (path or root, name) in items:
+            elif (path, name) in items:
                 copies += 1
             else:
-                items[path or root, name] = (path or root, name, transform)
+                items[path, name] = path, name, transform
         if copies:
             self._source.warn(
                 "parts", f"further copies of its objects on the build plate are left out ({copies})"
@@ -145,17 +166,16 @@ class _Package:
 
     def parts(self, path: str, name: str, place: Floats, depth: int) -> list[ReadMesh]:
         """The meshes of an object and of its components, at their places."""
-        model = self.model(path)
-        if name not in model.objects:
+        one = self.model(path).objects.get(name)
+        if one is None:
             raise ValueError(f"it names object {name[:50]}, which it lacks")
         if depth > 50:
             raise ValueError("its components form a circle")
         self._parts += 1
         check_parts(self._parts)
         found = []
-        one = model.objects[name]
         if one.triangles:
-            mesh = self._mesh(path, name)
+            mesh = self._mesh(path, name, one)
             self._faces += len(mesh.faces)
             check_faces(self._faces)
             found.append(mesh.transformed(place))
@@ -163,49 +183,42 @@ class _Package:
             found += self.parts(other or path, child, place @ _matrix(transform), depth + 1)
         return found
 
-    def _mesh(self, path: str, name: str) -> ReadMesh:
-        key = (path, name)
-        if key not in self._meshes:
-            model = self.model(path)
-            one = model.objects[name]
+    def _mesh(self, path: str, name: str, one: _Object) -> ReadMesh:
+        if (path, name) not in self._meshes:
             vertices = np.array(one.vertices, np.float64).reshape(-1, 3)
             faces = np.array(one.triangles, np.int64).reshape(-1, 3)
-            if faces.min(initial=0) < 0 or faces.max(initial=0) >= len(vertices):
-                raise IndexError
-            mesh = ReadMesh(vertices, faces, self._colours(model, one))
-            self._meshes[key] = mesh.without_unused_vertices()
-        return self._meshes[key]
+            mesh = ReadMesh(vertices, faces, self._colours(self.model(path), one))
+            self._meshes[path, name] = mesh.without_unused_vertices()
+        return self._meshes[path, name]
 
     def _colours(self, model: _Model, one: _Object) -> SurfaceColours | None:
-        default = (one.group, one.index, one.index, one.index) if one.group else None
-        rows_of: dict[str, list[list[int]]] = {}
-        for row, found in enumerate(one.properties):
-            if (entry := found or default) is not None:
-                group, *indices = entry
-                rows_of.setdefault(group, []).append([row, *indices])
+        rows_of: dict[str, list[tuple[int, ...]]] = {}
+        for row, (group, *entries) in enumerate(one.properties):
+            if group:
+                rows_of.setdefault(group, []).append((row, *entries))
         if not rows_of:
             return None
-        painting = Painting(len(one.properties))
+        painted = SurfaceColours.plain(len(one.properties))
         for group, table in rows_of.items():
-            entries = np.array(table)
-            rows = entries[:, 0]
-            corners = entries[:, 1:]
-            if group in model.colours:
-                painting.corners[rows] = np.array(model.colours[group])[corners]
-            elif group in model.coordinates:
-                texture = self._texture(model, group)
-                if texture is not None:
-                    uv = np.array(model.coordinates[group])[corners]
-                    painting.add_texture(rows, texture, uv)
-            else:
+            if group not in model.groups:
                 self._source.warn(
                     "material",
                     "it has materials of a kind that is not read; they are shown in white",
                 )
-        return painting.finished()
+                continue
+            indices = np.array(table)
+            rows = indices[:, 0]
+            known = np.array(model.groups[group])
+            check_corners(indices[:, 1:], len(known), "a colour")
+            values = known[indices[:, 1:]]
+            if group not in model.texture_of:
+                painted.corners[rows] = values
+            elif (texture := self._texture(model, group)) is not None:
+                painted = painted.with_texture(rows, texture, values)
+        return painted
 
     def _texture(self, model: _Model, group: str) -> Bytes | None:
-        path = model.paths.get(model.texture_of.get(group, ""), "")
+        path = model.paths.get(model.texture_of[group], "")
 
         def read_content() -> bytes | None:
             try:
@@ -231,7 +244,7 @@ def _matrix(text: str) -> Floats:
     """(4, 4) of the 12 numbers of a transform, which 3MF writes for row vectors."""
     T = np.eye(4)
     if text:
-        T[:3] = finite_words(text, 12).reshape(4, 3).T
+        T[:3] = fixed_numbers(text, 12).reshape(4, 3).T
     return T
 
 
@@ -240,49 +253,46 @@ def _parsed(data: bytes) -> _Model:
     check_xml(data)
     model = _Model()
     current = _Object()
-    group = ""
+    group: list[tuple[float, ...]] = []
     counts: Counter[str] = Counter()
 
     def start(tag: str, attributes: Attributes) -> None:
         nonlocal current, group
         kind = tag.rpartition(":")[2]
+        most = _MOST.get(kind, MAX_MESH_PARTS)
         counts[kind] += 1
-        if counts[kind] > _MOST.get(kind, MAX_MESH_PARTS):
-            raise ValueError(f"more than {_MOST.get(kind, MAX_MESH_PARTS):,} of {kind[:50]!r}")
-        plain = {name.rpartition(":")[2]: value for name, value in attributes.items()}
+        if counts[kind] > most:
+            raise ValueError(f"more than {most:,} of {kind[:50]!r}")
+        given = {name.rpartition(":")[2]: value for name, value in attributes.items()}
         if kind == "vertex":
-            current.vertices.extend((float(plain["x"]), float(plain["y"]), float(plain["z"])))
+            current.vertices.extend((float(given["x"]), float(given["y"]), float(given["z"])))
         elif kind == "triangle":
-            current.triangles.extend((int(plain["v1"]), int(plain["v2"]), int(plain["v3"])))
-            current.properties.append(_property(plain, current))
+            current.add_triangle(given)
         elif kind == "object":
-            current = model.objects[plain["id"]] = _Object(
-                plain.get("pid", ""), int(plain.get("pindex", 0)), plain.get("type", "model")
-            )
-        elif kind == "item" and plain.get("printable", "1") in ("0", "false"):
+            index = int(given.get("pindex", 0))
+            plain = given.get("pid", ""), index, index, index
+            current = model.objects[given["id"]] = _Object(plain, given.get("type", "model"))
+        elif kind == "item" and given.get("printable", "1") in ("0", "false"):
             model.unread.add("items that are not printed")
         elif kind in ("component", "item"):
             copies = model.items if kind == "item" else current.components
-            copies.append((plain.get("path", ""), plain["objectid"], plain.get("transform", "")))
+            copies.append((given.get("path", ""), given["objectid"], given.get("transform", "")))
         elif kind == "model":
-            model.unit = plain.get("unit", "millimeter")
+            model.unit = given.get("unit", "millimeter")
             if model.unit not in (*_UNITS, _MICRON):
                 raise ValueError(f"its unit {model.unit[:50]!r} is unknown")
-        elif kind in ("basematerials", "colorgroup"):
-            group = plain["id"]
-            model.colours[group] = []
+        elif kind in ("basematerials", "colorgroup", "texture2dgroup"):
+            group = model.groups[given["id"]] = []
+            if "texid" in given:
+                model.texture_of[given["id"]] = given["texid"]
         elif kind in ("base", "color"):
-            model.colours[group].append(_colour(plain.get("displaycolor", plain.get("color", ""))))
-        elif kind == "texture2dgroup":
-            group = plain["id"]
-            model.coordinates[group] = []
-            model.texture_of[group] = plain["texid"]
+            group.append(_colour(given.get("displaycolor", given.get("color", ""))))
         elif kind == "tex2coord":
-            model.coordinates[group].append((float(plain["u"]), float(plain["v"])))
+            group.append((float(given["u"]), float(given["v"])))
         elif kind in _UNREAD:
             model.unread.add(kind)
         elif kind == "texture2d":
-            model.paths[plain["id"]] = plain["path"]
+            model.paths[given["id"]] = given["path"]
 
     parser = xml.parsers.expat.ParserCreate()
     parser.StartElementHandler = start
@@ -293,19 +303,7 @@ def _parsed(data: bytes) -> _Model:
     return model
 
 
-def _property(attributes: Attributes, current: _Object) -> tuple[str, int, int, int] | None:
-    """The group of properties of a triangle, and the entries of its corners."""
-    if "p1" not in attributes:
-        return None
-    first, second, third = (int(attributes.get(k, attributes["p1"])) for k in ("p1", "p2", "p3"))
-    if min(first, second, third) < 0:
-        raise IndexError
-    return attributes.get("pid", current.group), first, second, third
-
-
-def _colour(text: str) -> tuple[int, int, int]:
+def _colour(text: str) -> tuple[int, ...]:
     """#RRGGBB or #RRGGBBAA; white for anything else."""
-    found = re.match(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", text)
-    if found is None:
-        return 255, 255, 255
-    return int(found[1], 16), int(found[2], 16), int(found[3], 16)
+    found = re.match(r"#?([0-9a-fA-F]{6})", text)
+    return (255, 255, 255) if found is None else tuple(bytes.fromhex(found[1]))

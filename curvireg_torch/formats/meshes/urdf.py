@@ -5,6 +5,7 @@ yourdfpy reads the same tree of joints. It would replace some 60 lines here, not
 meshes, their bounds and colours, and would bring lxml as another dependency.
 """
 
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,19 +13,20 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from trimesh.transformations import euler_matrix
+from trimesh.transformations import compose_matrix
 
 from ...errors import MAX_TABLE_BYTES, MeshError
 from ...utils.aliases import Fields
-from ...utils.arrays import Bytes, Floats
+from ...utils.arrays import Floats
 from ...utils.choices import UNITS
 from ..xml_files import read_xml
 from .colours import SurfaceColours, byte_colours
 from .limits import check_faces, check_parts
-from .source import MeshSource, ReadMesh, finite_words, is_file_name
+from .source import MeshSource, ReadMesh, fixed_numbers, is_file_name
 
 _URDF_FOLDERS = ("robots", "urdf")  # of ROS packages, beside their meshes
 ReadPart = Callable[[MeshSource], ReadMesh]
+Colour = tuple[Any, ...]
 
 
 def read_urdf(source: MeshSource, read_part: ReadPart, link: str | None = None) -> ReadMesh:
@@ -61,17 +63,17 @@ def _places(robot: Any, links: Fields) -> dict[str, Floats]:
         if parent is None or child is None:
             raise ValueError("a joint without parent or child")
         above[str(child.get("link"))] = (str(parent.get("link")), _origin(joint))
-    places: dict[str, Floats] = {}
-    for name in links:
-        chain = [name]
-        while chain[-1] not in places and chain[-1] in above:
-            if len(chain) > len(above):
-                raise ValueError("its joints form a circle")
-            chain.append(above[chain[-1]][0])
-        places.setdefault(chain[-1], np.eye(4))
-        for child in reversed(chain[:-1]):
-            parent_name, place = above[child]
-            places[child] = places[parent_name] @ place
+    below = defaultdict(list)
+    for name, (parent_name, _) in above.items():
+        below[parent_name].append(name)
+    places = {name: np.eye(4) for name in {*links, *below} - above.keys()}
+    waiting = [*places]
+    for parent_name in waiting:  # which grows
+        for name in below[parent_name]:
+            places[name] = places[parent_name] @ above[name][1]
+        waiting += below[parent_name]
+    if not links.keys() <= places.keys():
+        raise ValueError("its joints form a circle")
     return {name: places[name] for name in links}
 
 
@@ -80,30 +82,29 @@ def _origin(element: Any) -> Floats:
     origin = element.find("origin")
     if origin is None:
         return np.eye(4)
-    T = np.asarray(euler_matrix(*finite_words(origin.get("rpy", "0 0 0"), 3)))
-    T[:3, 3] = finite_words(origin.get("xyz", "0 0 0"), 3)
-    return T
+    rpy = fixed_numbers(origin.get("rpy", "0 0 0"), 3)
+    xyz = fixed_numbers(origin.get("xyz", "0 0 0"), 3)
+    return np.asarray(compose_matrix(angles=rpy, translate=xyz))
 
 
-def _colour(material: Any) -> Bytes | None:
-    """(3,) of a material's ``color``, None without one."""
+def _colour(material: Any) -> Colour | None:
+    """The bytes of a material's ``color``, None without one."""
     colour = material.find("color")
     if colour is None:
         return None
-    return byte_colours(finite_words(colour.get("rgba", "1 1 1 1"), 4)[:3])
+    return tuple(byte_colours(fixed_numbers(colour.get("rgba", "1 1 1 1"), 4)[:3]))
 
 
 class _Parts:
     """The visible parts of links; each mesh file is read once."""
 
     def __init__(
-        self, source: MeshSource, read_part: ReadPart, colours: dict[str, Bytes | None]
+        self, source: MeshSource, read_part: ReadPart, colours: dict[str, Colour | None]
     ) -> None:
         self._source = source
         self._read_part = read_part
         self._colours = colours
-        self._meshes: dict[Path, ReadMesh] = {}
-        self._paths: dict[str, Path | None] = {}
+        self._meshes: dict[str, ReadMesh | None] = {}
         self.missing: list[str] = []
         self._faces = 0
         self._visuals = 0
@@ -114,45 +115,47 @@ class _Parts:
         for visual in link.findall("visual"):
             self._visuals += 1
             check_parts(self._visuals)
-            geometry = visual.find("geometry")
-            mesh = None if geometry is None else self._mesh(geometry)
+            mesh = self._mesh(visual)
             if mesh is None:
                 continue
             self._faces += len(mesh.faces)
             check_faces(self._faces)
-            colour = self._colour_of(visual)
-            if mesh.colours is None and colour is not None:
-                mesh = replace(mesh, colours=SurfaceColours.plain(len(mesh.faces), colour))
+            material = visual.find("material")
+            if mesh.colours is None and material is not None:
+                colour = _colour(material) or self._colours.get(str(material.get("name")))
+                if colour is not None:
+                    mesh = replace(mesh, colours=SurfaceColours.plain(len(mesh.faces), colour))
             found.append(mesh.transformed(place @ _origin(visual)))
         return found
 
-    def _colour_of(self, visual: Any) -> Bytes | None:
-        material = visual.find("material")
-        if material is None:
-            return None
-        own = _colour(material)
-        return self._colours.get(str(material.get("name"))) if own is None else own
-
-    def _mesh(self, geometry: Any) -> ReadMesh | None:
+    def _mesh(self, visual: Any) -> ReadMesh | None:
         """A mesh file, or a box, cylinder or sphere."""
-        for shape in geometry:
+        for shape in visual.findall("geometry/*"):
             if shape.tag == "mesh":
                 return self._file(shape)
             if shape.tag == "box":
-                return _of_trimesh(trimesh.creation.box(finite_words(shape.get("size", ""), 3)))
-            radius = float(finite_words(shape.get("radius", ""), 1)[0])
+                size = fixed_numbers(shape.get("size", ""), 3)
+                return ReadMesh.of_surface(trimesh.creation.box(size))
+            (radius,) = fixed_numbers(shape.get("radius", ""), 1)
             if shape.tag == "sphere":
-                return _of_trimesh(trimesh.creation.icosphere(4, radius))
+                return ReadMesh.of_surface(trimesh.creation.icosphere(4, radius))
             if shape.tag == "cylinder":
-                length = float(finite_words(shape.get("length", ""), 1)[0])
-                return _of_trimesh(trimesh.creation.cylinder(radius, length, sections=64))
+                (length,) = fixed_numbers(shape.get("length", ""), 1)
+                cylinder = trimesh.creation.cylinder(radius, length, sections=64)
+                return ReadMesh.of_surface(cylinder)
         return None
 
     def _file(self, shape: Any) -> ReadMesh | None:
         name = str(shape.get("filename", ""))
-        if name not in self._paths:
-            self._paths[name] = self._find(name)
-        path = self._paths[name]
+        if name not in self._meshes:
+            self._meshes[name] = self._read(name)
+        mesh = self._meshes[name]
+        scale = fixed_numbers(shape.get("scale", "1 1 1"), 3)
+        return None if mesh is None else mesh.transformed(np.diag([*scale, 1.0]))
+
+    def _read(self, name: str) -> ReadMesh | None:
+        """The mesh of a file in metres; None, with a warning, without the file."""
+        path = self._find(name)
         if path is None:
             self.missing.append(name)
             self._source.warn(
@@ -160,19 +163,13 @@ class _Parts:
                 f"the mesh {name[:100]} is missing in its folder; name its folder (textures)",
             )
             return None
-        if path not in self._meshes:
-            if path.suffix.lower() == ".urdf":
-                raise ValueError("a URDF names a URDF as a mesh")
-            part = self._source.beside(path)
-            mesh = self._read_part(part)
-            for warning in part.warnings:
-                self._source.warn(warning.kind, f"{path.name}: {warning.text}")
-            mesh = mesh.without_unused_vertices()
-            self._meshes[path] = replace(mesh, vertices=mesh.vertices * UNITS[mesh.unit or "m"])
-        mesh = self._meshes[path]
-        T = np.eye(4)
-        T[:3, :3] *= finite_words(shape.get("scale", "1 1 1"), 3)
-        return mesh.transformed(T)
+        if path.suffix.lower() == ".urdf":
+            raise ValueError("a URDF names a URDF as a mesh")
+        part = self._source.beside(path)
+        mesh = self._read_part(part).without_unused_vertices()
+        for warning in part.warnings:
+            self._source.warn(warning.kind, f"{path.name}: {warning.text}")
+        return replace(mesh, vertices=mesh.vertices * UNITS[mesh.unit or "m"])
 
     def _find(self, name: str) -> Path | None:
         """``package://robot/meshes/a.stl`` and ``file://`` names: their ends are looked for in the
@@ -195,7 +192,3 @@ class _Parts:
         is_package = folder.name in _URDF_FOLDERS or (package / "package.xml").is_file()
         if is_package and package.name == name and package not in self._source.extra:
             self._source.extra.append(package)
-
-
-def _of_trimesh(mesh: trimesh.Trimesh) -> ReadMesh:
-    return ReadMesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))

@@ -23,8 +23,8 @@ from ...utils.arrays import Array, Bytes, Integers
 from ...utils.programs import run_program
 from ...utils.srgb import srgb
 from .cad import bounded
-from .colours import Painting, SurfaceColours, byte_colours
-from .polygons import triangles_of_faces
+from .colours import SurfaceColours, byte_colours
+from .polygons import triangulated
 from .source import MeshSource, ReadMesh
 
 _PROGRAM = Path(__file__).with_name("usd_parts.py")
@@ -74,18 +74,13 @@ def _parts_of(path: Path) -> tuple[Fields, Arrays]:
 
 def _part(source: MeshSource, key: str, part: Fields, arrays: Arrays) -> ReadMesh:
     """One mesh at its place, with its colours."""
-    vertices = arrays[key + "points"]
-    counts = arrays[key + "counts"]
-    starts = np.cumsum(counts) - counts
-    material = arrays[key + "material"]
-    kept = (material >= 0) & (counts > 2)
     indices = arrays[key + "indices"]
-    spans = zip(starts[kept], counts[kept], strict=True)
-    polygons = [indices[start : start + count].tolist() for start, count in spans]
-    faces, owner, places = triangles_of_faces(vertices, polygons)
-    corner = starts[kept][owner][:, None] + places
-    colours = _colours(source, key, part, arrays, corner, material[kept][owner])
-    mesh = ReadMesh(vertices, faces, colours)
+    corner, owner = triangulated(arrays[key + "points"], indices, arrays[key + "counts"])
+    material = arrays[key + "material"][owner]
+    kept = material >= 0  # the others are holes
+    corner = corner[kept]
+    colours = _colours(source, key, part, arrays, corner, material[kept])
+    mesh = ReadMesh(arrays[key + "points"], indices[corner], colours)
     mesh = mesh.turned_over() if part["left_handed"] else mesh
     return mesh.transformed(np.array(part["place"]))
 
@@ -102,20 +97,21 @@ def _colours(
     own = arrays.get(key + "colour")
     if own is None and not part["materials"]:
         return None
-    painting = Painting(len(corner))
+    painted = SurfaceColours.plain(len(corner))
     if own is not None:
-        painting.corners = byte_colours(srgb(own[corner]))
+        painted.corners[:] = byte_colours(srgb(own[corner]))
     for number, surface in enumerate(part["materials"]):
         faces = material == number + 1
         if "colour" in surface:
-            painting.corners[faces] = byte_colours(srgb(np.array(surface["colour"])))
+            painted.corners[faces] = byte_colours(srgb(np.array(surface["colour"])))
         if surface.get("unread"):
             source.warn("texture", "a texture is made in a way that is not read; it is left out")
         texture = _texture(source, surface) if "texture" in surface else None
         if texture is not None:
-            painting.corners[faces] = _tint(source, surface)
-            painting.add_texture(faces, texture, arrays[f"{key}uv{number}"][corner[faces]])
-    return painting.finished()
+            painted.corners[faces] = _tint(source, surface)
+            uv = arrays[f"{key}uv{number}"][corner[faces]]
+            painted = painted.with_texture(faces, texture, uv)
+    return painted
 
 
 def _tint(source: MeshSource, surface: Fields) -> Bytes:

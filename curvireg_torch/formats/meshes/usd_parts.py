@@ -17,6 +17,7 @@ from pxr import Ar, Sdf, Usd, UsdGeom, UsdShade
 
 MAX_PRIMS_PER_PART = 20  # groups, materials and lights beside the parts
 MAX_LAYERS = 1000
+DAMAGED = "not a USD file, or damaged"
 COLOUR_NAMES = ("diffuseColor", "baseColor", "base_color")
 
 
@@ -25,14 +26,11 @@ def main() -> None:
     arrays: dict[str, Any] = {}
     try:
         layers = _used_layers(path)
-        about = read(path, arrays, int(most_parts), int(most_faces))
-        about["layers"] = layers
+        about = {**read(path, arrays, int(most_parts), int(most_faces)), "layers": layers}
     except ValueError as error:
-        arrays = {}
         about = {"error": str(error)}
     except RuntimeError:  # of OpenUSD, in several lines
-        arrays = {}
-        about = {"error": "not a USD file, or damaged"}
+        about = {"error": DAMAGED}
     np.savez(out, about=np.array(json.dumps(about)), **arrays)
 
 
@@ -48,7 +46,7 @@ def _used_layers(path: str) -> list[str]:
         layer = Sdf.Layer.FindOrOpen(identifier)
         if layer is None:
             if identifier == path:
-                raise ValueError("not a USD file, or damaged")
+                raise ValueError(DAMAGED)
             continue  # a stage goes on without it
         layer.Traverse("/", _refuse_clips(layer))
         # a part that refers to another of the same file names none
@@ -88,39 +86,35 @@ def read(path: str, arrays: dict[str, Any], most_parts: int, most_faces: int) ->
     """Unit, axis and parts of a stage at its first frame."""
     stage = Usd.Stage.Open(path)
     if stage is None:
-        raise ValueError("not a USD file, or damaged")
+        raise ValueError(DAMAGED)
     metres = None
     if UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         metres = float(UsdGeom.GetStageMetersPerUnit(stage))
-    about: dict[str, Any] = {"metres": metres, "up": str(UsdGeom.GetStageUpAxis(stage)).lower()}
     parts: list[dict[str, Any]] = []
     left_out: set[str] = set()
     places = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
-    prims = 0
     faces = 0
     walk = iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()))
-    for prim in walk:
-        prims += 1
-        if len(parts) > most_parts or prims > MAX_PRIMS_PER_PART * most_parts:
+    for number, prim in enumerate(walk):
+        if len(parts) > most_parts or number >= MAX_PRIMS_PER_PART * most_parts:
             raise ValueError(f"more than {most_parts:,} parts; join them")
         if is_hidden(prim):
             walk.PruneChildren()
-            continue
-        if prim.IsA(UsdGeom.PointInstancer):
+        elif prim.IsA(UsdGeom.PointInstancer):
             raise ValueError("point instancers are not read; export their copies as meshes")
-        if prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh):
+        elif prim.IsA(UsdGeom.Mesh):
+            part = read_mesh(UsdGeom.Mesh(prim), f"{len(parts)}.", arrays)
+            if part is None:
+                continue
+            faces += part.pop("faces")
+            if faces > most_faces:
+                raise ValueError(f"more than {most_faces:,} faces; simplify it")
+            part["place"] = np.array(places.GetLocalToWorldTransform(prim)).T.tolist()
+            parts.append(part)
+        elif prim.IsA(UsdGeom.Gprim):
             left_out.add(prim.GetTypeName())
-        if not prim.IsA(UsdGeom.Mesh):
-            continue
-        part = read_mesh(UsdGeom.Mesh(prim), f"{len(parts)}.", arrays)
-        if part is None:
-            continue
-        faces += part.pop("faces")
-        if faces > most_faces:
-            raise ValueError(f"more than {most_faces:,} faces; simplify it")
-        part["place"] = np.array(places.GetLocalToWorldTransform(prim)).T.tolist()
-        parts.append(part)
-    return {**about, "parts": parts, "left_out": sorted(left_out)}
+    up = str(UsdGeom.GetStageUpAxis(stage)).lower()
+    return {"metres": metres, "up": up, "parts": parts, "left_out": sorted(left_out)}
 
 
 def is_hidden(prim: Any) -> bool:
@@ -147,24 +141,23 @@ def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | N
     arrays[key + "points"] = points[used]
     arrays[key + "counts"] = counts
     arrays[key + "indices"] = own.reshape(-1)
-    colour = _by_corner(UsdGeom.Gprim(mesh).GetDisplayColorPrimvar(), counts, indices, len(points))
+    colour = _by_corner(UsdGeom.Gprim(mesh).GetDisplayColorPrimvar(), counts, indices)
     if colour is not None:
         arrays[key + "colour"] = colour.reshape(-1, 3)
     materials: list[dict[str, Any]] = []
     of_face = np.zeros(len(counts), np.int64)
     prim = mesh.GetPrim()
-    bound = [(prim, None), *((g.GetPrim(), g) for g in UsdGeom.Subset.GetAllGeomSubsets(mesh))]
-    for owner, subset in bound:
+    subsets = UsdGeom.Subset.GetAllGeomSubsets(mesh)
+    bound = [(one.GetPrim(), _array(one.GetIndicesAttr())) for one in subsets]
+    for owner, faces in [(prim, np.arange(len(counts))), *bound]:
         material = UsdShade.MaterialBindingAPI(owner).ComputeBoundMaterial()[0]
-        faces = np.arange(len(counts)) if subset is None else _array(subset.GetIndicesAttr())
         if not material or not faces.size:
             continue
         surface = _surface_of(material)
-        name = surface.get("coordinates")
         uv = None
-        if name:
+        if name := surface.get("coordinates"):
             primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
-            uv = _by_corner(primvar, counts, indices, len(points))
+            uv = _by_corner(primvar, counts, indices)
         if uv is None:
             surface.pop("texture", None)
         else:
@@ -188,24 +181,19 @@ def _array(attribute: Any, kind: Any = np.int64) -> Any:
     return np.array([] if values is None else values, kind)
 
 
-def _by_corner(primvar: Any, counts: Any, indices: Any, vertices: int) -> Any:
+def _by_corner(primvar: Any, counts: Any, indices: Any) -> Any:
     """Values of a primvar for each corner of each face; None if it has none, or too few."""
     if not primvar or not primvar.HasValue():
         return None
-    flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime())
-    values = np.array([] if flat is None else flat, np.float64)
-    if not len(values):
-        return None
-    corners = len(indices)
-    chosen = {
-        UsdGeom.Tokens.constant: (1, np.zeros(corners, np.int64)),
-        UsdGeom.Tokens.uniform: (len(counts), np.repeat(np.arange(len(counts)), counts)),
-        UsdGeom.Tokens.vertex: (vertices, indices),
-        UsdGeom.Tokens.varying: (vertices, indices),
-        UsdGeom.Tokens.faceVarying: (corners, np.arange(corners)),
-    }
-    wanted, index = chosen.get(primvar.GetInterpolation(), (0, None))
-    return values[index] if index is not None and len(values) >= wanted else None
+    values = np.array(primvar.ComputeFlattened(Usd.TimeCode.EarliestTime()) or [], np.float64)
+    index = {
+        UsdGeom.Tokens.constant: np.zeros(len(indices), np.int64),
+        UsdGeom.Tokens.uniform: np.repeat(np.arange(len(counts)), counts),
+        UsdGeom.Tokens.vertex: indices,
+        UsdGeom.Tokens.varying: indices,
+        UsdGeom.Tokens.faceVarying: np.arange(len(indices)),
+    }.get(primvar.GetInterpolation())
+    return None if index is None or index.max(initial=0) >= len(values) else values[index]
 
 
 def _surface_of(material: Any) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import cad, usd
 from tests._support.meshes import load as load
+from tests._support.refusals import raises
 
 
 @pytest.fixture
@@ -37,12 +38,23 @@ def here(monkeypatch):
 
 
 @pytest.fixture
+def read(tmp_path, load):
+    """Write a glTF file under construction, and load it."""
+    return lambda tree: load(tree.write(tmp_path / "a.gltf"))
+
+
+@pytest.fixture
+def loaded(tmp_path):
+    """Write a glTF file under construction, and load it without any warning."""
+    return lambda tree: cr.load_mesh(tree.write(tmp_path / "a.gltf"))
+
+
+@pytest.fixture
 def refused(write):
     """Write a file, and check that it is refused as a mesh with a message that matches."""
 
     def check(name, content, match, **options):
         path = write(name, content)
-        with pytest.raises(MeshError, match=match):
-            cr.load_mesh(path, **options)
+        raises(MeshError, match, cr.load_mesh, path, **options)
 
     return check

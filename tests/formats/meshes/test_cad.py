@@ -7,7 +7,6 @@ import zipfile
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError, MissingDependencyError
@@ -16,6 +15,8 @@ from curvireg_torch.formats.meshes.files import mesh_files
 from curvireg_torch.utils import extras
 from curvireg_torch.utils.extras import is_installed
 from tests._support.quick import slow_after
+from tests._support.refusals import raises
+from tests.formats.meshes.pictures import encoded, noise
 from tests.formats.meshes.step import iges_file, step_file
 
 BOX = trimesh.creation.box((30.0, 20.0, 10.0))
@@ -35,10 +36,13 @@ def test_step_files_keep_their_unit_and_axes(tmp_path, load, unit, suffix):
     assert (mesh.unit, mesh.up, texts) == (unit, "z", [])
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 2, 1]], atol=1e-6)
     assert mesh.surface.volume == pytest.approx(6.0, rel=1e-6)
-    with pytest.raises(
-        MeshError, match=f"the file states its unit, {unit}, which is not 'dm'; leave the unit out"
-    ):
-        cr.load_mesh(path, unit="dm")
+    raises(
+        MeshError,
+        f"the file states its unit, {unit}, which is not 'dm'; leave the unit out",
+        cr.load_mesh,
+        path,
+        unit="dm",
+    )
 
 
 @needs("cascadio")
@@ -78,8 +82,7 @@ def test_step_files_are_bounded_in_size_and_time(tmp_path, monkeypatch):
         ("MAX_CAD_SECONDS", 0.001, "took more than 0.001 seconds"),
     ):
         monkeypatch.setattr(cad, name, value)
-        with pytest.raises(MeshError, match=match):
-            cr.load_mesh(path)
+        raises(MeshError, match, cr.load_mesh, path)
         monkeypatch.undo()
 
 
@@ -189,13 +192,12 @@ def collada(asset="", image="label.png", nodes="", more=""):
 )
 def test_collada_files_keep_their_unit_and_axes(tmp_path, load, asset, unit, up, scale):
     (tmp_path / "a.dae").write_text(collada(asset))
-    pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "label.png")
+    (tmp_path / "label.png").write_bytes(encoded(noise()))
     mesh, texts = load(tmp_path / "a.dae")
     assert (mesh.unit, mesh.up, texts) == (unit, up, [])
     np.testing.assert_allclose(mesh.bounds, np.array([[10, 0, 0], [14, 2, 0]]) * scale, atol=1e-6)
     colours = mesh.colours
-    np.testing.assert_array_equal(colours.textures[0], pixels)
+    np.testing.assert_array_equal(colours.textures[0], noise())
     np.testing.assert_allclose(colours.uv[0], [[0, 0], [1, 0], [0, 1]], atol=1e-6)
     assert tmp_path / "label.png" in mesh_files(tmp_path / "a.dae")
 
@@ -285,8 +287,7 @@ def test_threemf_places_objects_and_their_components(tmp_path, load):
     assert (mesh.unit, mesh.up, len(mesh.faces), texts) == ("in", "z", 24, [])
     np.testing.assert_allclose(mesh.bounds, [[-15, -5, -10], [110, 5, 20]])
     assert mesh.surface.volume == pytest.approx(2 * 6000)
-    with pytest.raises(MeshError, match="states its unit, in"):
-        cr.load_mesh(tmp_path / "a.3mf", unit="mm")
+    raises(MeshError, "states its unit, in", cr.load_mesh, tmp_path / "a.3mf", unit="mm")
     for unit, name, scale in (
         ("", "mm", 1.0),
         ('unit="micron"', "mm", 1e-3),
@@ -339,17 +340,15 @@ def test_threemf_reads_colours_and_textures(tmp_path, load):
         resources = group + solid(1, "", f'pid="6" {words}')
         colours = load(threemf(tmp_path / "a.3mf", resources))[0].colours
         assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
-    pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "a.png")
     texture = '<m:texture2d id="7" path="/3D/a.png" contenttype="image/png"/>'
     texture += '<m:texture2dgroup id="8" texid="7"><m:tex2coord u="0" v="0"/>'
     texture += '<m:tex2coord u="1" v="0"/><m:tex2coord u="0" v="1"/></m:texture2dgroup>'
     resources = texture + solid(1, "", 'pid="8" p1="0" p2="1" p3="2"')
-    pictures = {"3D/a.png": (tmp_path / "a.png").read_bytes()}
+    pictures = {"3D/a.png": encoded(noise())}
     mesh, texts = load(threemf(tmp_path / "a.3mf", resources, more=pictures))
     colours = mesh.colours
     assert not texts
-    np.testing.assert_array_equal(colours.textures[0], pixels)
+    np.testing.assert_array_equal(colours.textures[0], noise())
     assert colours.uv[0].tolist() == [[0, 0], [1, 0], [0, 1]]
     assert "/3D/a.png is missing" in load(threemf(tmp_path / "a.3mf", resources))[1][0]
     other = solid(1, "", 'pid="9" p1="0"')
@@ -393,19 +392,15 @@ def test_hostile_threemf_files_are_refused(tmp_path, monkeypatch):
         ("<object", ITEM, "damaged XML"),
     ):
         threemf(path, resources, items)
-        with pytest.raises(MeshError, match=match):
-            cr.load_mesh(path)
+        raises(MeshError, match, cr.load_mesh, path)
     path.write_bytes(b"PK\3\4 no archive")
-    with pytest.raises(MeshError, match="no zip archive"):
-        cr.load_mesh(path)
+    raises(MeshError, "no zip archive", cr.load_mesh, path)
     threemf(path, solid(1), unit='unit="mile"')
-    with pytest.raises(MeshError, match="its unit 'mile' is unknown"):
-        cr.load_mesh(path)
+    raises(MeshError, "its unit 'mile' is unknown", cr.load_mesh, path)
     threemf(path, solid(1) + " " * 1_000_000)
     assert path.stat().st_size < 10_000
     monkeypatch.setattr("curvireg_torch.formats.meshes.threemf.MAX_MESH_BYTES", 500_000)
-    with pytest.raises(MeshError, match="unpacks to more than 500,000 bytes"):
-        cr.load_mesh(path)
+    raises(MeshError, "unpacks to more than 500,000 bytes", cr.load_mesh, path)
 
 
 ROBOT = """<robot name="arm"><material name="blue"><color rgba="0 0 1 1"/></material>
@@ -440,10 +435,20 @@ def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path, load):
     assert names == {"arm.urdf", "base.stl", "tip.ply"}
     colours = mesh.colours
     assert (colours.corners[:12] == [0, 0, 255]).all()
-    with pytest.raises(MeshError, match=r"no link 'hand'; it has base, tip, ball"):
-        cr.load_mesh(tmp_path / "arm.urdf", link="hand")
-    with pytest.raises(MeshError, match="only a URDF has links"):
-        cr.load_mesh(tmp_path / "meshes" / "base.stl", link="tip")
+    raises(
+        MeshError,
+        r"no link 'hand'; it has base, tip, ball",
+        cr.load_mesh,
+        tmp_path / "arm.urdf",
+        link="hand",
+    )
+    raises(
+        MeshError,
+        "only a URDF has links",
+        cr.load_mesh,
+        tmp_path / "meshes" / "base.stl",
+        link="tip",
+    )
 
 
 def test_urdf_names_meshes_that_it_does_not_find(tmp_path, load):
@@ -484,8 +489,7 @@ def test_meshes_of_a_package_are_found_from_its_folder_urdf(
         assert load(path)[0].extents.tolist() == [3.0, 2.0, 1.0]
         return
     text = rf"the meshes that it names are missing in its folder \({name}\); name their folder"
-    with pytest.raises(MeshError, match=text):
-        cr.load_mesh(path)
+    raises(MeshError, text, cr.load_mesh, path)
 
 
 def test_hostile_urdf_files_are_refused(tmp_path, monkeypatch):
@@ -502,9 +506,7 @@ def test_hostile_urdf_files_are_refused(tmp_path, monkeypatch):
         ("<robot>", "cannot be read"),
     ):
         path.write_text(changed)
-        with pytest.raises(MeshError, match=match):
-            cr.load_mesh(path)
+        raises(MeshError, match, cr.load_mesh, path)
     path.write_text(text)
     monkeypatch.setattr("curvireg_torch.formats.meshes.limits.MAX_MESH_FACES", 20)
-    with pytest.raises(MeshError, match="more than 20 faces"):
-        cr.load_mesh(path)
+    raises(MeshError, "more than 20 faces", cr.load_mesh, path)

@@ -3,11 +3,12 @@ import json
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 
 from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes.files import mesh_digest, mesh_files
 from curvireg_torch.mesh import load_mesh
+from tests._support.refusals import raises
+from tests.formats.meshes.pictures import encoded, noise
 from tests.formats.meshes.test_hostile_meshes import tree
 
 EXPECTED = {suffix: {f"part.{suffix}"} for suffix in ("gltf", "obj", "ply", "glb", "stl", "off")}
@@ -16,15 +17,10 @@ EXPECTED["obj"] |= {"part.mtl", "picture.png"}
 EXPECTED["ply"] |= {"picture.png"}
 
 
-def picture(path, shade=0):
-    pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3) + shade
-    Image.fromarray(pixels).save(path)
-
-
 def write(folder, suffix):
     """A mesh of one format with companion files."""
     folder.mkdir(parents=True, exist_ok=True)
-    picture(folder / "picture.png")
+    (folder / "picture.png").write_bytes(encoded(noise()))
     (folder / "beside.png").write_bytes(b"no part of the mesh")
     path = folder / f"part.{suffix}"
     if suffix == "gltf":
@@ -96,16 +92,14 @@ STARTS = {
 def test_what_a_download_leaves_in_place_of_a_mesh_is_named(tmp_path, suffix, start, words):
     path = tmp_path / f"a.{suffix}"
     path.write_bytes(start)
-    with pytest.raises(MeshError, match=words):
-        load_mesh(path)
+    raises(MeshError, words, load_mesh, path)
 
 
 @pytest.mark.parametrize(("kind", "name"), [("ply", "a.obj"), ("glb", "b.stl")])
 def test_a_mesh_under_the_name_of_another_kind_is_named(tmp_path, kind, name):
     path = tmp_path / name
     path.write_bytes(trimesh.creation.box().export(file_type=kind))
-    with pytest.raises(MeshError, match=rf"of another kind than its name says; name it \.{kind}"):
-        load_mesh(path)
+    raises(MeshError, rf"of another kind than its name says; name it \.{kind}", load_mesh, path)
 
 
 def test_mesh_digest_accepts_damaged_meshes_and_banks(tmp_path):

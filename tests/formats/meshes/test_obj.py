@@ -6,13 +6,14 @@ import warnings
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.cli.options import MESH, add_options, register_options
 from curvireg_torch.errors import MeshError, MissingFileError
 from curvireg_torch.mesh import mesh_symmetries
 from tests._support.doubling import check_linear
+from tests._support.refusals import raises
+from tests.formats.meshes.pictures import encoded, noise
 
 POINTS = "".join(f"v {x} {y} {z}\n" for x in (0, 3) for y in (0, 2) for z in (0, 1))
 UV = "vt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\n"
@@ -29,10 +30,10 @@ def textured(faces):
     return "".join(f"f {a}/1 {b}/2 {c}/3\n" for a, b, c in rows)
 
 
-def picture(path, seed=0):
+def picture(path):
     path.parent.mkdir(parents=True, exist_ok=True)
-    pixels = np.random.default_rng(seed).integers(0, 255, (8, 8, 3), np.uint8)
-    Image.fromarray(pixels).save(path)
+    pixels = noise()
+    path.write_bytes(encoded(pixels))
     return pixels
 
 
@@ -209,8 +210,7 @@ def test_an_obj_of_many_parts_is_refused(tmp_path):
     for key in ("o", "g", "usemtl", "mtllib"):
         path = tmp_path / "a.obj"
         path.write_text(POINTS + "".join(f"{key} p{k}\nf 1 2 3\n" for k in range(10_001)))
-        with pytest.raises(MeshError, match="more than 10,000 parts; join them"):
-            cr.load_mesh(path)
+        raises(MeshError, "more than 10,000 parts; join them", cr.load_mesh, path)
 
 
 def test_a_can_of_two_materials_that_look_alike_is_grey(tmp_path, write, load):
@@ -237,7 +237,11 @@ def test_options_of_the_command_line_reach_the_reader(tmp_path):
     mesh = register_options(arguments).load_mesh(path)
     assert mesh.has_colours
     arguments = parser.parse_args(["--link", "tip"])
-    with pytest.raises(MeshError, match="only a URDF has links"):
-        register_options(arguments).load_mesh(path)
-    with pytest.raises(MissingFileError, match="no such folder; check the folder of the textures"):
-        cr.load_mesh(path, textures=tmp_path / "nowhere")
+    raises(MeshError, "only a URDF has links", register_options(arguments).load_mesh, path)
+    raises(
+        MissingFileError,
+        "no such folder; check the folder of the textures",
+        cr.load_mesh,
+        path,
+        textures=tmp_path / "nowhere",
+    )

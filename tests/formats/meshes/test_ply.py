@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from tests._support.doubling import check_linear
+from tests.formats.meshes.pictures import encoded, noise
 
 POINTS = [(0, 0, 0), (4, 0, 0), (4, 2, 0), (0, 2, 0)]
 FACES = "3 0 1 2\n3 0 2 3\n"
@@ -39,10 +39,9 @@ def test_colours_under_every_name(write, load, prefix, short, kind, scale):
 
 
 def pictures(folder):
-    found = [np.random.default_rng(k).integers(0, 255, (8, 8, 3), np.uint8) for k in range(2)]
-    for k, pixels in enumerate(found):
-        Image.fromarray(pixels).save(folder / f"{k}.png")
-    return found
+    for k in range(2):
+        (folder / f"{k}.png").write_bytes(encoded(noise(k)))
+    return noise(0), noise(1)
 
 
 def test_two_textures_are_read_or_named(tmp_path, write, load):
@@ -94,8 +93,7 @@ def test_concave_faces_keep_their_texture_coordinates(tmp_path, write, load):
 @pytest.mark.parametrize("encoding", ["latin-1", "gbk", "utf-8", "utf-8-sig"])
 def test_remarks_in_any_encoding(tmp_path, write, load, encoding):
     name = "外壳" if encoding == "gbk" else "Gehäuse"
-    pixels = pictures(tmp_path)
-    Image.fromarray(pixels[0]).save(tmp_path / f"{name}.png")
+    (tmp_path / f"{name}.png").write_bytes(encoded(noise()))
     comments = f"comment made for {name}\nobj_info {name}\ncomment TextureFile {name}.png\n"
     vertex = "property float s\nproperty float t\n"
     text = header(vertex, "", comments=comments) + rows(["0 0", "1 0", "1 1", "0 1"]) + FACES

@@ -8,7 +8,8 @@ from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
-from curvireg_torch.formats.meshes.polygons import divide_faces
+from curvireg_torch.formats.meshes.polygons import triangulated
+from tests._support.refusals import raises
 
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
 
@@ -22,7 +23,7 @@ def square_with_hole(n):
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_divide_faces_covers_polygons_once(axis, sign):
+def test_triangles_cover_polygons_once(axis, sign):
     rng = np.random.default_rng(0)
     turns = [
         np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, n))) * rng.uniform(0.2, 1, n)
@@ -34,9 +35,9 @@ def test_divide_faces_covers_polygons_once(axis, sign):
         polygon = np.insert(flat[::sign], axis, 0.3 * flat[::sign].sum(axis=1), axis=1)
         # A plane over (u, v) of slope (0.3, 0.3): area grows by sqrt(1.18). Equal sums mean that
         # none overlap.
-        a, b, c = np.moveaxis(
-            polygon[np.array(divide_faces(polygon, [[0, 1, 2], [*range(len(polygon))]])[1])], 1, 0
-        )
+        corners = np.array([0, 1, 2, *range(len(polygon))])
+        picked, owner = triangulated(polygon, corners, np.array([3, len(polygon)]))
+        a, b, c = np.moveaxis(polygon[corners[picked[owner == 1]]], 1, 0)
         (x, y), area = flat.T, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum()
         expected = 0.5 * abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()))
         assert area == pytest.approx(expected * 1.18**0.5, rel=1e-9)
@@ -122,13 +123,11 @@ def test_load_mesh_reads_binary_ply_of_one_number_of_corners(tmp_path):
     assert cr.load_mesh(path).surface.area == pytest.approx(2 * 7)
     # 12 corners as three quads
     path.write_bytes(binary_ply([[0, 1, 2, 3], [4, 5, 6], [7, 8, 9, 10, 11]], vertices))
-    with pytest.raises(
-        MeshError, match="different numbers of corners are not read; export triangles"
-    ):
-        cr.load_mesh(path)
+    raises(
+        MeshError, "different numbers of corners are not read; export triangles", cr.load_mesh, path
+    )
     path.write_bytes(binary_ply(faces, vertices))
-    with pytest.raises(MeshError, match="different numbers of corners: export triangles"):
-        cr.load_mesh(path)
+    raises(MeshError, "different numbers of corners: export triangles", cr.load_mesh, path)
 
 
 BOX = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
@@ -156,8 +155,7 @@ def test_load_mesh_reads_every_face_of_an_obj(tmp_path, line, triangles):
 def test_load_mesh_refuses_obj_that_counts_from_0(tmp_path, face):
     path = tmp_path / "a.obj"
     path.write_text(f"{BOX}{face}\n")
-    with pytest.raises(MeshError, match="vertex 0; OBJ files count from 1"):
-        cr.load_mesh(path)
+    raises(MeshError, "vertex 0; OBJ files count from 1", cr.load_mesh, path)
 
 
 @pytest.mark.parametrize("kind", ["off", "obj", "ply"])
@@ -172,5 +170,4 @@ def test_load_mesh_refuses_damaged_polygons(tmp_path, kind):
         if kind == "obj" and damaged == data[:-12]:
             continue  # a shorter OBJ is another OBJ
         path.write_bytes(damaged)
-        with pytest.raises(MeshError, match=path.name):
-            cr.load_mesh(path)
+        raises(MeshError, path.name, cr.load_mesh, path)

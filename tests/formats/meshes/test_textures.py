@@ -12,6 +12,7 @@ import curvireg_torch as cr
 from curvireg_torch.formats.meshes import colours, source
 from curvireg_torch.mesh import as_mesh
 from tests._support.quick import slow_after
+from tests.formats.meshes.pictures import encoded, noise
 from tests.formats.meshes.test_files import write as write_mesh
 from tests.formats.meshes.test_obj import write as write_obj
 
@@ -20,21 +21,18 @@ FORMATS = dict.fromkeys(("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM"), True)
 FORMATS |= dict.fromkeys(("GIF", "TGA", "PCX", "ICO", "EPS", "PDF", "SGI"), False)
 
 
-def encoded(kind, size=(8, 8), **how):
+def picture(kind, size=(8, 8), **how):
     if kind == "EPS":
         return POSTSCRIPT
-    pixels = np.random.default_rng(0).integers(0, 255, (*size[::-1], 3), np.uint8)
-    file = BytesIO()
-    Image.fromarray(pixels).save(file, kind, **how)
-    return file.getvalue()
+    return encoded(np.resize(noise(), (*size[::-1], 3)), kind, **how)
 
 
-def write(folder, carrier, picture):
+def write(folder, carrier, content):
     """A mesh of one format whose texture is called picture.png, whatever it holds."""
     path = write_mesh(folder, "gltf" if carrier == "data" else carrier)
-    (folder / "picture.png").write_bytes(picture)
+    (folder / "picture.png").write_bytes(content)
     if carrier == "data":
-        uri = "data:image/png;base64," + base64.b64encode(picture).decode()
+        uri = "data:image/png;base64," + base64.b64encode(content).decode()
         path.write_text(path.read_text().replace("picture.png", uri))
     return path
 
@@ -46,7 +44,7 @@ def test_only_the_formats_of_photographs_are_decoded(tmp_path, load, monkeypatch
         raise AssertionError(f"a program is started: {words} {how}")
 
     monkeypatch.setattr("subprocess.Popen", refuse)
-    mesh, texts = load(write(tmp_path, carrier, encoded(kind)))
+    mesh, texts = load(write(tmp_path, carrier, picture(kind)))
     assert mesh.has_colours == FORMATS[kind]
     assert [warning.kind for warning in mesh.warnings] == ([] if FORMATS[kind] else ["texture"])
     assert all("not an image that is read" in text for text in texts)
@@ -62,10 +60,10 @@ def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path):
 
 
 def test_pixels_of_all_textures_together_are_bounded(tmp_path, load, monkeypatch):
-    picture = encoded("PNG", (40, 25))
+    content = picture("PNG", (40, 25))
     path = write_obj(tmp_path, "".join(f"newmtl m{k}\nmap_Kd {k}.png\n" for k in range(4)))
     for k in range(4):
-        (tmp_path / f"{k}.png").write_bytes(picture)
+        (tmp_path / f"{k}.png").write_bytes(content)
     head, _, faces = path.read_text().partition("usemtl label\n")
     rows = faces.splitlines(keepends=True)
     parts = [f"usemtl m{k}\n" + "".join(rows[3 * k : 3 * k + 3]) for k in range(4)]
@@ -81,15 +79,15 @@ def test_pixels_of_all_textures_together_are_bounded(tmp_path, load, monkeypatch
 
 
 def test_a_texture_of_many_pixels_or_scans_is_left_out(tmp_path, load, monkeypatch):
-    path = write(tmp_path, "obj", encoded("PNG", (200, 100)))
+    path = write(tmp_path, "obj", picture("PNG", (200, 100)))
     monkeypatch.setattr("curvireg_torch.utils.pictures.MAX_IMAGE_PIXELS", 19_999)
     assert "pixels; scale it down" in load(path)[1][0]
     monkeypatch.undo()
-    path = write(tmp_path, "obj", encoded("JPEG", (64, 64), progressive=True))
+    path = write(tmp_path, "obj", picture("JPEG", (64, 64), progressive=True))
     assert not load(path)[1]
     monkeypatch.setattr("curvireg_torch.utils.pictures.MAX_IMAGE_SCANS", 5)
     assert "scans, more than 5" in load(path)[1][0]
-    path = write(tmp_path, "obj", encoded("PNG")[:60])
+    path = write(tmp_path, "obj", picture("PNG")[:60])
     assert "picture.png cannot be used" in load(path)[1][0]
 
 

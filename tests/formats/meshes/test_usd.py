@@ -1,11 +1,9 @@
 """USD files, which are generated: their places, units, axes, colours and textures."""
 
 import zipfile
-from io import BytesIO
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
@@ -13,6 +11,8 @@ from curvireg_torch.formats.meshes import usd
 from curvireg_torch.formats.meshes.files import mesh_files
 from curvireg_torch.mesh.colours import colours_at
 from curvireg_torch.utils.extras import is_installed
+from tests._support.refusals import raises
+from tests.formats.meshes.pictures import encoded, painted
 
 pytestmark = [
     pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed"),
@@ -68,24 +68,12 @@ def stage(*parts, about='metersPerUnit = 0.001\n    upAxis = "Z"', place=""):
     return f'#usda 1.0\n(\n    {about}\n)\ndef Xform "part"\n{{\n{place}{body}\n}}\n'
 
 
-def painted(colour):
-    file = BytesIO()
-    Image.new("RGB", (4, 4), colour).save(file, "PNG")
-    return file.getvalue()
-
-
 def textures_of(mesh):
     colours = mesh.colours
     return [texture[0, 0].tolist() for texture in colours.textures]
 
 
-def png():
-    pixels = np.zeros((8, 8, 3), np.uint8)
-    pixels[:4] = 255, 0, 0
-    pixels[4:] = 0, 0, 255
-    file = BytesIO()
-    Image.fromarray(pixels).save(file, "PNG")
-    return file.getvalue()
+RED_ON_BLUE = encoded([[[255, 0, 0]] * 8] * 4 + [[[0, 0, 255]] * 8] * 4)
 
 
 def package(path, text, **more):
@@ -152,10 +140,10 @@ def test_textures_by_the_coordinates_that_they_name(tmp_path, load, kind):
     if kind == "usda":
         path.write_text(text)
         (tmp_path / "textures").mkdir()
-        (tmp_path / "textures" / "print.png").write_bytes(png())
+        (tmp_path / "textures" / "print.png").write_bytes(RED_ON_BLUE)
         assert mesh_files(path) == [path, tmp_path / "textures" / "print.png"]
     else:
-        package(path, text, textures__print_png=png())
+        package(path, text, textures__print_png=RED_ON_BLUE)
     mesh, texts = load(path)
     assert not texts
     found = mesh.colours
@@ -235,8 +223,7 @@ def test_references_stay_in_the_folder(tmp_path, load):
     assert mesh_files(path) == [path, tmp_path / "in" / "other.usda"]
     for name in ("../other.usda", str(tmp_path / "other.usda")):
         path.write_text(text.format(name=name))
-        with pytest.raises(MeshError, match="outside of its folder; flatten it"):
-            load(path)
+        raises(MeshError, "outside of its folder; flatten it", load, path)
 
 
 @pytest.mark.parametrize(
@@ -276,6 +263,5 @@ def test_bounds(tmp_path, monkeypatch):
         ("MAX_CAD_SECONDS", 0.001, "took more than 0.001 seconds"),
     ):
         monkeypatch.setattr(usd, name, value)
-        with pytest.raises(MeshError, match=match):
-            cr.load_mesh(path, unit="mm")
+        raises(MeshError, match, cr.load_mesh, path, unit="mm")
         monkeypatch.undo()
