@@ -39,6 +39,12 @@ def written(path, content):
     return path
 
 
+@pytest.fixture
+def boxes_json(tmp_path):
+    """Write a JSON file of boxes."""
+    return partial(written, tmp_path / "boxes.json")
+
+
 def box_of(path, photo, size=SIZE, orientation=1):
     """The box of a photograph that need not exist."""
     return BoxFile(path).box(Path(photo), lambda: PictureSize(size, orientation))
@@ -170,10 +176,10 @@ PIXELS = (16, 12, 32, 24)  # BOX in COCO
 CORNER = (1, 1, 8, 8)  # OTHER
 
 
-def test_numbers_of_images_that_come_twice_are_refused(tmp_path):
+def test_numbers_of_images_that_come_twice_are_refused(boxes_json):
     content = annotations(("a.png", PIXELS), ("b.png", CORNER))
     content["images"][1]["id"] = 90
-    file = written(tmp_path / "boxes.json", content)
+    file = boxes_json(content)
     raises(
         InvalidInputError, r"boxes.json: two entries have the id 90, as in", box_of, file, "a.png"
     )
@@ -181,15 +187,15 @@ def test_numbers_of_images_that_come_twice_are_refused(tmp_path):
     assert box_of(written(file, {**content, "annotations": content["annotations"][:1]}), "a.png")
 
 
-def test_annotations_of_coco_name_images_and_categories(tmp_path):
-    file = written(tmp_path / "boxes.json", annotations(("shots\\000012.png", PIXELS)))
+def test_annotations_of_coco_name_images_and_categories(boxes_json):
+    file = boxes_json(annotations(("shots\\000012.png", PIXELS)))
     assert box_of(f"{file}:can", "shots/000012.png") == BOX
     raises(InvalidInputError, "no box of label 'box'", box_of, f"{file}:box", "shots/000012.png")
 
 
-def test_photographs_of_one_name_are_told_apart_by_their_folders(tmp_path):
+def test_photographs_of_one_name_are_told_apart_by_their_folders(tmp_path, boxes_json):
     content = annotations(("set/cam1/000001.jpg", CORNER), ("set/cam2/000001.jpg", PIXELS))
-    boxes = BoxFile(written(tmp_path / "boxes.json", content))
+    boxes = BoxFile(boxes_json(content))
     of = partial(boxes.box, picture=lambda: PictureSize(SIZE))
     assert of(Path("cam2/000001.jpg")) == BOX
     assert of(Path("elsewhere/cam1/000001.jpg")) == OTHER
@@ -197,9 +203,9 @@ def test_photographs_of_one_name_are_told_apart_by_their_folders(tmp_path):
     raises(InvalidInputError, "no box in", of, Path("cam3/000001.jpg"))
 
 
-def test_the_folder_of_a_file_of_one_folder_need_not_be_that_of_the_photographs(tmp_path):
+def test_the_folder_of_a_file_of_one_folder_need_not_be_that_of_the_photographs(boxes_json):
     content = annotations(("export/000001.jpg", CORNER), ("export/000002.jpg", PIXELS))
-    boxes = BoxFile(written(tmp_path / "boxes.json", content))
+    boxes = BoxFile(boxes_json(content))
     picture = partial(PictureSize, SIZE)
     with pytest.warns(CurviregWarning, match=r"boxes of export/000002.jpg are used for .*shots/0"):
         assert boxes.box(Path("shots/000002.jpg"), picture) == BOX
@@ -215,9 +221,9 @@ def test_the_folder_of_a_file_of_one_folder_need_not_be_that_of_the_photographs(
         assert boxes.box(Path("export/000002.jpg"), picture) == BOX
 
 
-def test_two_images_that_may_be_the_photograph_are_refused(tmp_path):
+def test_two_images_that_may_be_the_photograph_are_refused(boxes_json):
     content = annotations(("cam1/a.jpg", CORNER), ("cam1/a.png", PIXELS))
-    file = written(tmp_path / "boxes.json", content)
+    file = boxes_json(content)
     assert box_of(file, "cam1/a.png") == BOX
     raises(
         InvalidInputError, r"cam1/a.jpg and cam1/a.png may both be this", box_of, file, "cam1/a.tif"
@@ -235,7 +241,7 @@ def test_two_images_that_may_be_the_photograph_are_refused(tmp_path):
         ((64, 48), 6, (64, 48)),  # of a tool that turns pictures, as ours
     ],
 )
-def test_boxes_of_pictures_of_another_size_or_not_turned(tmp_path, annotated, orientation, shown):
+def test_boxes_of_pictures_of_another_size_or_not_turned(boxes_json, annotated, orientation, shown):
     """The box of some white pixels, in a picture of another size or orientation."""
     height, width = annotated
     is_stored = orientation > 4 and height < width
@@ -249,15 +255,15 @@ def test_boxes_of_pictures_of_another_size_or_not_turned(tmp_path, annotated, or
     sides = (factor * (np.ptp(columns) + 1), factor * (np.ptp(rows) + 1))
     box = tuple(map(float, (*corner, *sides)))
     content = annotations(("a.jpg", box), height=height, width=width)
-    file = written(tmp_path / "boxes.json", content)
+    file = boxes_json(content)
     rows, columns = seen[..., 0].nonzero()
     expected = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
     found = box_of(file, "a.jpg", shown, orientation)
     assert found == pytest.approx(tuple(value - 0.5 for value in map(float, expected)))
 
 
-def test_boxes_of_a_picture_of_other_proportions_are_refused(tmp_path):
-    file = written(tmp_path / "boxes.json", annotations(("a.jpg", PIXELS), height=48, width=80))
+def test_boxes_of_a_picture_of_other_proportions_are_refused(boxes_json):
+    file = boxes_json(annotations(("a.jpg", PIXELS), height=48, width=80))
     for orientation in (1, 6):
         raises(
             InvalidInputError,
@@ -273,10 +279,10 @@ def test_boxes_of_a_picture_of_other_proportions_are_refused(tmp_path):
     )  # 90 degrees, which no EXIF data explain
 
 
-def test_detections_of_bop_are_of_scenes(tmp_path):
+def test_detections_of_bop_are_of_scenes(tmp_path, boxes_json):
     boxes = [item(12, 0.9, (0, 0, 9, 9), scene_id=2), item(12, 0.5, scene_id=1)]
     photo = tmp_path / "000001" / "rgb" / "000012.png"
-    assert box_of(written(tmp_path / "boxes.json", boxes), photo) == BOX
+    assert box_of(boxes_json(boxes), photo) == BOX
     without = written(tmp_path / "without.json", [item(12, 0.9, (0, 0, 9, 9)), boxes[1]])
     assert box_of(without, photo) == BOX, "the scene goes before the number alone"
     only = written(tmp_path / "only.json", boxes[1:])
@@ -300,10 +306,10 @@ def test_megapose_writes_corners_of_the_only_photograph(tmp_path, photo):
     assert boxes.of_frame("turn-000001", SIZE) == boxes.of_frame("turn-000002", SIZE) == BOX
 
 
-def test_boxes_of_two_labels_without_scores_need_a_choice(tmp_path):
+def test_boxes_of_two_labels_without_scores_need_a_choice(tmp_path, boxes_json):
     content = annotations(("a.jpg", CORNER), ("b.jpg", PIXELS))
     content["annotations"][1] |= {"image_id": 90, "category_id": 4}
-    file = written(tmp_path / "boxes.json", content)
+    file = boxes_json(content)
     raises(InvalidInputError, "as PATH:LABEL: can, box", box_of, file, "a.jpg")
     assert box_of(f"{file}:box", "a.jpg") == box_of(f"{file}:4", "a.jpg") == BOX
     content["annotations"][1]["category_id"] = 3  # two of a kind: the first

@@ -20,6 +20,13 @@ OBJECT = np.zeros((20, 30), bool)
 OBJECT[4:14, 6:24] = True
 
 
+def check(mask, expected=OBJECT):
+    """A mask shows this, without borders between."""
+    found = read_mask(mask)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, expected)
+
+
 def written(path, values, mode=None):
     Image.fromarray(values, mode).save(path)
     return path
@@ -42,8 +49,8 @@ def test_labels_are_chosen_by_their_number(tmp_path):
     labels[OBJECT] = 2
     labels[:3] = 5
     file = written(tmp_path / "labels.png", labels)
-    assert np.array_equal(read_mask(f"{file}:2"), OBJECT.astype(np.float32))
-    assert np.array_equal(read_mask(f"{file}:5"), (labels == 5).astype(np.float32))
+    check(f"{file}:2")
+    check(f"{file}:5", labels == 5)
     raises(
         InvalidInputError,
         "no white pixel, but labels 2, 5; choose one as FILE:LABEL",
@@ -52,9 +59,9 @@ def test_labels_are_chosen_by_their_number(tmp_path):
     )
     raises(InvalidInputError, "no pixel has the label 3; it has 0, 2, 5", read_mask, f"{file}:3")
     bright = written(tmp_path / "bright.png", np.where(labels == 2, 200, labels).astype(np.uint8))
-    assert np.array_equal(read_mask(f"{bright}:200") > 0, OBJECT)
+    check(f"{bright}:200")
     deep = written(tmp_path / "deep.png", (300 * labels.astype(np.uint16)))
-    assert np.array_equal(read_mask(f"{deep}:600") > 0, OBJECT)
+    check(f"{deep}:600")
     raises(MissingFileError, r"lost\.png:2: no such file", read_mask, tmp_path / "lost.png:2")
     raises(InvalidInputError, "a folder; give the file of one mask", read_mask, tmp_path)
     assert mask_file("a:b") == mask_file(mask_file("a:b")[0])
@@ -65,24 +72,22 @@ def test_palettes_are_labels_unless_they_are_black_and_white(tmp_path):
     picture = Image.fromarray(labels, "P")
     picture.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
     picture.save(tmp_path / "voc.png")
-    assert np.array_equal(read_mask(tmp_path / "voc.png"), OBJECT.astype(np.float32))
-    assert np.array_equal(read_mask(f"{tmp_path / 'voc.png'}:2"), OBJECT.astype(np.float32))
+    check(tmp_path / "voc.png")
+    check(f"{tmp_path / 'voc.png'}:2")
     picture = Image.fromarray(1 - OBJECT.astype(np.uint8), "P")
     picture.putpalette([255, 255, 255, 0, 0, 0])
     picture.save(tmp_path / "inverse.png")
-    assert np.array_equal(read_mask(tmp_path / "inverse.png"), OBJECT.astype(np.float32))
+    check(tmp_path / "inverse.png")
 
 
 def test_transparency_that_varies_is_the_mask(tmp_path):
     picture = np.random.default_rng(0).integers(0, 255, (20, 30, 4), dtype=np.uint8)
     picture[..., 3] = 255 * OBJECT
     file = written(tmp_path / "cut.png", picture)
-    assert np.array_equal(read_mask(file), OBJECT.astype(np.float32))
+    check(file)
     picture[...] = 255 * OBJECT[..., None]
     picture[..., 3] = 255
-    assert np.array_equal(
-        read_mask(written(tmp_path / "opaque.png", picture)), OBJECT.astype(np.float32)
-    )
+    check(written(tmp_path / "opaque.png", picture))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])

@@ -1,7 +1,6 @@
 """Poses as other tools write them."""
 
 import json
-import re
 
 import numpy as np
 import pytest
@@ -17,21 +16,29 @@ T = np.block([[R, t[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 QUATERNION = Rotation.from_matrix(R).as_quat().tolist()  # x, y, z, w
 
 
+MINE = {"rotation": R.tolist(), "translation": t.tolist()}
+
+
 def check(found, unit=None, confidence=None, expected=T):
     np.testing.assert_allclose(found.T, expected, atol=1e-12, rtol=0)
     assert (found.unit, found.confidence) == (unit, confidence)
 
 
-def written(tmp_path, content):
-    file = tmp_path / "pose.json"
-    file.write_text(json.dumps(content))
-    return file
+@pytest.fixture
+def read(tmp_path):
+    """Write a file of poses, and read the one of a name, or the only one."""
+
+    def written_and_read(content, name="", **options):
+        (tmp_path / "pose.json").write_text(json.dumps(content))
+        return read_pose(tmp_path / f"pose.json{name and ':'}{name}", **options)
+
+    return written_and_read
 
 
 @pytest.mark.parametrize(
     "content",
     [
-        {"rotation": R.tolist(), "translation": t.tolist()},
+        MINE,
         {"R": R.flatten().tolist(), "t": t[:, None].tolist()},
         {"T_cam_from_model": T.tolist()},
         {"pose": T[:3].flatten().tolist()},
@@ -40,8 +47,8 @@ def written(tmp_path, content):
     ],
     ids=["result", "short", "transform", "3 x 4", "column by column", "list"],
 )
-def test_json(tmp_path, content):
-    check(read_pose(written(tmp_path, content)))
+def test_json(read, content):
+    check(read(content))
 
 
 def test_text_of_numpy_and_arrays(tmp_path):
@@ -52,117 +59,76 @@ def test_text_of_numpy_and_arrays(tmp_path):
     check(read_pose(tmp_path / "pose.npy"))
 
 
-def test_a_pose_without_translation_is_read_row_by_row(tmp_path):
+def test_a_pose_without_translation_is_read_row_by_row(read):
     """Row by row and column by column it has 0 0 0 1 at its end."""
     centred = T.copy()
     centred[:3, 3] = 0.0
-    check(read_pose(written(tmp_path, centred.tolist())), expected=centred)
+    check(read(centred.tolist()), expected=centred)
 
 
-def test_the_confidence_of_a_result_is_kept(tmp_path):
-    content = {"rotation": R.tolist(), "translation": t.tolist(), "confidence": 0.5}
-    check(read_pose(written(tmp_path, content)), confidence=0.5)
-
-
-def test_megapose_writes_quaternions_and_metres(tmp_path):
+def test_megapose_writes_quaternions_and_metres(read):
     mine = {"label": "can", "TWO": [QUATERNION, t.tolist()]}
-    check(read_pose(written(tmp_path, [mine])), "m")
-    file = written(tmp_path, [{"label": "box", "TWO": [[0, 0, 0, 1], [0, 0, 1]]}, mine])
-    check(read_pose(tmp_path / "pose.json:can"), "m")
-    check(read_pose(tmp_path / "pose.json:1"), "m")
-    check(read_pose(file, mesh="can"), "m")
-    raises(
-        InvalidInputError,
-        "expected one pose, got 2 of 2; choose one as FILE:NAME: box, can",
-        read_pose,
-        file,
-    )
-    raises(
-        InvalidInputError,
-        r"in the world of TWC",
-        read_pose,
-        written(tmp_path, [{**mine, "TWC": [[0, 0, 0, 1], [0, 0, 1]]}]),
-    )
-    raises(
-        InvalidInputError,
-        "a quaternion x, y, z, w of length 1, got 2",
-        read_pose,
-        written(tmp_path, [{"TWO": [[0, 0, 0, 2], [0, 0, 1]]}]),
-    )
+    check(read([mine]), "m")
+    both = [{"label": "box", "TWO": [[0, 0, 0, 1], [0, 0, 1]]}, mine]
+    for how in ({"name": "can"}, {"name": "1"}, {"mesh": "can"}):
+        check(read(both, **how), "m")
+    for content, words in (
+        (both, "expected one pose, got 2 of 2; choose one as FILE:NAME: box, can"),
+        ([{**mine, "TWC": [[0, 0, 0, 1], [0, 0, 1]]}], "in the world of TWC"),
+        ([{"TWO": [[0, 0, 0, 2], [0, 0, 1]]}], "a quaternion x, y, z, w of length 1, got 2"),
+    ):
+        raises(InvalidInputError, words, read, content)
 
 
-def test_bop_writes_millimetres_and_several_objects(tmp_path):
+def test_bop_writes_millimetres_and_several_objects(read):
     def entry(number, rotation):
         return {"cam_R_m2c": rotation.flatten().tolist(), "cam_t_m2c": t.tolist(), "obj_id": number}
 
-    truth = {"3": [entry(1, np.eye(3)), entry(5, R)], "12": [entry(5, np.eye(3)), entry(5, R)]}
-    file = written(tmp_path, truth)
-    check(read_pose(tmp_path / "pose.json:000003", mesh="obj_000005"), "mm")
-    check(read_pose(tmp_path / "pose.json:12:1"), "mm")
-    raises(
-        InvalidInputError,
-        "poses of several images; choose one as FILE:IMAGE_ID from 3, 12",
-        read_pose,
-        file,
-    )
-    raises(
-        InvalidInputError,
-        "expected one pose, got 2 of 2",
-        read_pose,
-        tmp_path / "pose.json:12",
-        mesh="obj_000005",
-    )
-    check(read_pose(written(tmp_path, {"7": [entry(1, R)]})), "mm")
-    check(read_pose(written(tmp_path, entry(1, R))), "mm")
+    other = np.eye(3)
+    truth = {"3": [entry(1, other), entry(5, R)], "12": [entry(5, other), entry(5, R)]}
+    check(read(truth, "000003", mesh="obj_000005"), "mm")
+    check(read(truth, "12:1"), "mm")
+    words = "poses of several images; choose one as FILE:IMAGE_ID from 3, 12"
+    raises(InvalidInputError, words, read, truth)
+    words = "expected one pose, got 2 of 2"
+    raises(InvalidInputError, words, read, truth, "12", mesh="obj_000005")
+    check(read({"7": [entry(1, R)]}), "mm")
+    check(read(entry(1, R)), "mm")
 
 
-def test_ros_writes_metres(tmp_path):
+def test_ros_writes_metres(read):
     q = dict(zip("xyzw", QUATERNION, strict=True))
     pose = {"position": dict(zip("xyz", t.tolist(), strict=True)), "orientation": q}
-    check(read_pose(written(tmp_path, {"header": {"frame_id": "camera"}, "pose": pose})), "m")
-    check(
-        read_pose(
-            written(tmp_path, {"header": {}, "pose": {"pose": pose, "covariance": [0.0] * 36}})
-        ),
-        "m",
-    )
-    raises(
-        InvalidInputError,
-        "expected position and orientation",
-        read_pose,
-        written(tmp_path, {"header": {}, "pose": [1]}),
-    )
+    check(read({"header": {"frame_id": "camera"}, "pose": pose}), "m")
+    check(read({"header": {}, "pose": {"pose": pose, "covariance": [0.0] * 36}}), "m")
+    words = "expected position and orientation"
+    raises(InvalidInputError, words, read, {"header": {}, "pose": [1]})
 
 
-def test_opengl_poses_look_along_minus_z(tmp_path):
+def test_opengl_poses_look_along_minus_z(read):
     flipped = np.diag([1.0, -1.0, -1.0, 1.0]) @ T
-    check(read_pose(written(tmp_path, flipped.tolist()), convention="opengl"))
+    check(read(flipped.tolist(), convention="opengl"))
 
 
-def test_what_is_no_pose_is_refused(tmp_path):
-    for content, words in (
-        ({"rotation": R.tolist(), "translation": None}, "register with a camera first"),
-        (
-            {"frame": "world", "rotation": R.tolist(), "translation": [0, 0, 1]},
-            "whose pose is in the world",
-        ),
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({**MINE, "translation": None}, "register with a camera first"),
+        ({**MINE, "frame": "world"}, "whose pose is in the world; .* as in 'photographs'"),
         ({"T": (2 * T).tolist()}, "a last row of 0 0 0 1"),
         ({"T": np.diag([2.0, 1, 1, 1]).tolist()}, "rigid"),
-        (
-            {"rotation": [1.0, 0, 0, 0], "translation": [0, 0, 1]},
-            "rotation: expected 9 finite numbers",
-        ),
+        ({**MINE, "rotation": [1.0, 0, 0, 0]}, "rotation: expected 9 finite numbers"),
         ({"quaternion": [0, 0, 0, 1], "translation": [0, 0, 1]}, "no rotation of 3 x 3 numbers"),
         ({"rotation": R.tolist()}, "no translation; expected JSON"),
         ([], "expected JSON with rotation and translation, or T_cam_from_model"),
         ("text", "expected JSON with rotation"),
-    ):
-        raises(
-            InvalidInputError,
-            re.escape("pose.json: ") + ".*" + words,
-            read_pose,
-            written(tmp_path, content),
-        )
+    ],
+)
+def test_what_is_no_pose_is_refused(read, content, words):
+    raises(InvalidInputError, rf"pose\.json: .*{words}", read, content)
+
+
+def test_a_missing_file_is_named(tmp_path):
     raises(MissingFileError, r"lost\.json:3: no such file", read_pose, tmp_path / "lost.json:3")
 
 
@@ -174,11 +140,5 @@ def test_what_is_no_pose_is_refused(tmp_path):
     ],
     ids=["schema 3", "schema 4"],
 )
-def test_results_of_both_schemas_are_start_poses(tmp_path, keys):
-    pose = {"rotation": R.tolist(), "translation": t.tolist(), "confidence": 0.8}
-    check(read_pose(written(tmp_path, {**keys, **pose})), confidence=0.8)
-
-
-def test_poses_in_the_world_are_no_start_poses(tmp_path):
-    pose = {"rotation": R.tolist(), "translation": t.tolist(), "frame": "world"}
-    raises(InvalidInputError, "as in 'photographs'", read_pose, written(tmp_path, pose))
+def test_results_of_both_schemas_are_start_poses(read, keys):
+    check(read({**keys, **MINE, "confidence": 0.8}), confidence=0.8)

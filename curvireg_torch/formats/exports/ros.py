@@ -59,7 +59,8 @@ def write_ros(
         raise InvalidInputError("--format ros: a pose without translation; give a camera")
     metres = UNITS[document["unit"] or "m"]
     position = dict(zip("xyz", (metres * x for x in document["translation"]), strict=True))
-    orientation = dict(zip("wxyz", document["quaternion"], strict=True))
+    w, *vector = document["quaternion"]
+    orientation = dict(zip("xyzw", (*vector, w), strict=True))
     header = {
         "stamp": dict(zip(("sec", "nanosec"), stamp, strict=True)),
         "frame_id": "world" if document["frame"] == "world" else frame,

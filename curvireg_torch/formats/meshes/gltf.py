@@ -122,19 +122,11 @@ def _check_sizes(tree: Fields) -> None:
             f"its buffer views or accessors claim more than {4 * MAX_MESH_BYTES:,} bytes"
         )
 
-    def count(index: Any) -> int:
-        accessor = accessors[_natural(index)]
-        if accessor.keys().isdisjoint(("sparse", "bufferView")):
-            raise ValueError(
-                "an accessor of a part has no data, as in compressed files; export without it"
-            )
-        return int(accessor["count"])
-
     def corners(part: Fields) -> int:
         """Corners of the faces of a part, or its vertices if these are more."""
         used = [*part["attributes"].values(), *([part["indices"]] if "indices" in part else [])]
         factor = 3 if part.get("mode") in (_STRIP, _FAN) else 1
-        return factor * max(map(count, used), default=0)
+        return factor * max((accessors[_natural(index)]["count"] for index in used), default=0)
 
     parts_of = [mesh["primitives"] for mesh in tree.get("meshes", [])]
     corners_of = [sum(map(corners, parts)) for parts in parts_of]
@@ -343,6 +335,10 @@ class _File:
         """(count, width) values of an accessor as they are stored: those of its view, or zeros, but
         for some that it names one by one."""
         accessor = self._item("accessors", index)
+        if accessor.keys().isdisjoint(("sparse", "bufferView")):
+            raise ValueError(
+                "an accessor of a part has no data, as in compressed files; export without it"
+            )
         kind = np.dtype(_TYPES[accessor["componentType"]])
         shape = (accessor["count"], _WIDTHS[accessor["type"]])
         stored = np.zeros(shape, kind)

@@ -10,6 +10,7 @@ from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import cad, usd
 from tests._support.meshes import load as load
 from tests._support.refusals import raises
+from tests.formats.meshes.packages import threemf
 
 
 @pytest.fixture
@@ -47,6 +48,12 @@ def read(tmp_path, load):
 def loaded(tmp_path):
     """Write a glTF file under construction, and load it without any warning."""
     return lambda tree: cr.load_mesh(tree.write(tmp_path / "a.gltf"))
+
+
+@pytest.fixture
+def read_3mf(tmp_path, load):
+    """Write a 3MF file, and load it."""
+    return lambda *content, **more: load(threemf(tmp_path / "a.3mf", *content, **more))
 
 
 @pytest.fixture

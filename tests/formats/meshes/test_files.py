@@ -1,6 +1,3 @@
-import json
-
-import numpy as np
 import pytest
 import trimesh
 
@@ -9,7 +6,7 @@ from curvireg_torch.formats.meshes.files import mesh_digest, mesh_files
 from curvireg_torch.mesh import load_mesh
 from tests._support.refusals import raises
 from tests.formats.meshes.pictures import encoded, noise
-from tests.formats.meshes.test_hostile_meshes import tree
+from tests.formats.meshes.test_gltf import textured
 
 EXPECTED = {suffix: {f"part.{suffix}"} for suffix in ("gltf", "obj", "ply", "glb", "stl", "off")}
 EXPECTED["gltf"] |= {"picture.png", "points.bin"}
@@ -24,26 +21,9 @@ def write(folder, suffix):
     (folder / "beside.png").write_bytes(b"no part of the mesh")
     path = folder / f"part.{suffix}"
     if suffix == "gltf":
-        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-        uv = np.float32([[0, 0], [1, 0], [0, 1]])
-        (folder / "points.bin").write_bytes(corners.tobytes() + uv.tobytes())
-        content = tree(
-            buffers=[{"byteLength": 60, "uri": "points.bin"}],
-            bufferViews=[
-                {"buffer": 0, "byteLength": 36},
-                {"buffer": 0, "byteOffset": 36, "byteLength": 24},
-            ],
-            images=[{"uri": "picture.png"}],
-            textures=[{"source": 0}],
-            materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-            meshes=[
-                {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}
-            ],
-        )
-        content["accessors"].append(
-            {"bufferView": 1, "componentType": 5126, "type": "VEC2", "count": 3}
-        )
-        path.write_text(json.dumps(content))
+        tree = textured({})
+        tree.content["images"] = [{"uri": "picture.png"}]
+        tree.write(path, folder / "points.bin")
     elif suffix == "obj":
         (folder / "part.mtl").write_text("newmtl skin\nmap_Kd picture.png\n")
         points = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"

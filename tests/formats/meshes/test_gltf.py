@@ -59,8 +59,12 @@ class Tree:
         uri = "data:image/png;base64," + base64.b64encode(encoded(pixels)).decode()
         self.content |= {"images": [{"uri": uri}], "textures": [{"source": 0}]}
 
-    def write(self, path):
+    def write(self, path, data=None):
+        """The path of the file, whose data are in another one, or in itself."""
         uri = "data:;base64," + base64.b64encode(self.data).decode()
+        if data is not None:
+            data.write_bytes(self.data)
+            uri = data.name
         self.content["buffers"] = [{"byteLength": len(self.data), "uri": uri}]
         path.write_text(json.dumps(self.content))
         return path

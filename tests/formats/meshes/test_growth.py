@@ -18,10 +18,10 @@ from curvireg_torch.formats.xml_files import read_xml
 from curvireg_torch.utils.extras import is_installed
 from curvireg_torch.utils.programs import run_program
 from tests._support.refusals import raises
+from tests.formats.meshes.packages import threemf as write_package
 from tests.formats.meshes.pictures import painted
 from tests.formats.meshes.step import step_file
 from tests.formats.meshes.test_cad import collada
-from tests.formats.meshes.test_cad import threemf as write_threemf
 from tests.formats.meshes.test_gltf import skinned
 from tests.formats.meshes.test_hostile_meshes import tree
 
@@ -111,7 +111,7 @@ def test_copies_of_a_part_do_not_hold_its_unused_vertices(tmp_path, suffix):
             all_copies = "".join(map(copy.format, range(copies)))
             whole = f'<object id="2"><components>{all_copies}</components></object>'
             resources = f'<object id="1">{solid}</object>{whole}'
-            path = write_threemf(tmp_path / "a.3mf", resources, '<item objectid="2"/>')
+            path = write_package(tmp_path / "a.3mf", resources, '<item objectid="2"/>')
         peaks.append(peak(path))
     assert peaks[1] - peaks[0] < UNUSED  # bytes: less than one for each vertex
 
@@ -237,7 +237,7 @@ def test_a_texture_of_many_groups_is_unpacked_once(tmp_path, monkeypatch):
     vertices = '<vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/>'
     mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
     resources = f'<texture2d id="7" path="/3D/a.png"/>{groups}<object id="1">{mesh}</object>'
-    path = write_threemf(tmp_path / "a.3mf", resources, more={"3D/a.png": PICTURE})
+    path = write_package(tmp_path / "a.3mf", resources, more={"3D/a.png": PICTURE})
     content = threemf._Package._content
     asked = []
 

@@ -18,8 +18,8 @@ from curvireg_torch.formats.meshes.polygons import triangulated
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, colour_bytes
 from curvireg_torch.mesh.colours import colours_of_parts
 from curvireg_torch.utils.extras import is_installed
+from tests.formats.meshes.packages import solid, threemf
 from tests.formats.meshes.pictures import painted
-from tests.formats.meshes.test_cad import solid, threemf
 from tests.formats.meshes.test_gltf import TRIANGLE, Tree, coordinates, skinned, textured
 from tests.formats.meshes.test_ply import header, rows
 from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, square, stage
@@ -239,12 +239,12 @@ def test_colours_of_faces_win_over_those_of_vertices(write):
 # 3MF
 
 
-def test_a_component_lies_in_the_frame_of_a_turned_item(tmp_path, load):
+def test_a_component_lies_in_the_frame_of_a_turned_item(read_3mf):
     turn = "0 1 0 -1 0 0 0 0 1"  # x becomes y
     component = '<component objectid="1" transform="1 0 0 0 1 0 0 0 1 100 0 0"/>'
     resources = solid(1) + f'<object id="2"><components>{component}</components></object>'
     item = f'<item objectid="2" transform="{turn} 0 0 7"/>'
-    mesh, _ = load(threemf(tmp_path / "a.3mf", resources, item))
+    mesh, _ = read_3mf(resources, item)
     np.testing.assert_allclose(mesh.bounds, [[-10, 85, 2], [10, 115, 12]])
 
 
@@ -256,13 +256,13 @@ def test_the_model_in_its_usual_place_is_the_first(tmp_path, load):
     assert len(load(path)[0].faces) == 12
 
 
-def test_properties_of_a_triangle_win_over_those_of_its_object(tmp_path, load):
+def test_properties_of_a_triangle_win_over_those_of_its_object(read_3mf):
     groups = "".join(
         f'<basematerials id="{k}"><base name="a" displaycolor="{colour}"/></basematerials>'
         for k, colour in ((5, "#FF0000"), (6, "#0000FF"))
     )
     resources = groups + solid(1, 'pid="5" pindex="0"', 'pid="6" p1="0"')
-    mesh, _ = load(threemf(tmp_path / "a.3mf", resources))
+    mesh, _ = read_3mf(resources)
     assert first_corners(mesh) == [BLUE] * 6 + [RED] * 6
 
 

@@ -1,0 +1,32 @@
+"""3MF files, which are zip archives."""
+
+import zipfile
+
+import trimesh
+
+BOX = trimesh.creation.box((30.0, 20.0, 10.0))
+ITEM = '<item objectid="1"/>'
+
+
+def threemf(path, resources, items=ITEM, *, unit='unit="inch"', more=None):
+    namespace = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+    text = (
+        f'<?xml version="1.0"?><model {unit} xmlns="{namespace}" xmlns:m="materials" '
+        f'xmlns:p="production">'
+    )
+    text += f"<resources>{resources}</resources><build>{items}</build></model>"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("3D/3dmodel.model", text)
+        for name, content in (more or {}).items():
+            archive.writestr(name, content)
+    return path
+
+
+def solid(number, attributes="", triangle=""):
+    vertices = "".join('<vertex x="{:g}" y="{:g}" z="{:g}"/>'.format(*v) for v in BOX.vertices)
+    faces = "".join(
+        f'<triangle v1="{a}" v2="{b}" v3="{c}" {triangle if k < 6 else ""}/>'
+        for k, (a, b, c) in enumerate(BOX.faces)
+    )
+    mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
+    return f'<object id="{number}" type="model" {attributes}>{mesh}</object>'
