@@ -12,7 +12,7 @@ from curvireg_torch.errors import ImageError, MissingDependencyError
 from curvireg_torch.formats import heif
 from curvireg_torch.formats.heif import heif_kind, open_photograph
 from tests._support.exif import exif
-from tests._support.refusals import raises
+from tests._support.refusals import refused
 
 
 @pytest.fixture
@@ -65,9 +65,11 @@ def test_heic_is_bounded_by_its_header(written, monkeypatch):
     monkeypatch.setattr("curvireg_torch.utils.pictures.MAX_IMAGE_PIXELS", 48 * 64)
     read_photo(file)
     monkeypatch.setattr("curvireg_torch.utils.pictures.MAX_IMAGE_PIXELS", 48 * 64 - 1)
-    raises(ImageError, "pixels; scale it down", open_photograph, file.read_bytes())
+    with refused("pixels; scale it down", ImageError):
+        open_photograph(file.read_bytes())
     monkeypatch.setattr(heif, "MAX_IMAGE_BYTES", 10)
-    raises(ImageError, "larger than 10 bytes", open_photograph, file.read_bytes())
+    with refused("larger than 10 bytes", ImageError):
+        open_photograph(file.read_bytes())
 
 
 def test_damaged_heic_is_refused_in_one_line(written, tmp_path):
@@ -82,17 +84,12 @@ def test_damaged_heic_is_refused_in_one_line(written, tmp_path):
 def test_a_missing_decoder_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + b"\0" * 99)
     monkeypatch.setitem(sys.modules, "pi_heif", None)
-    raises(
-        MissingDependencyError,
-        r"a\.heic: HEIC needs pi-heif: pip install .*heic",
-        read_photo,
-        tmp_path / "a.heic",
-    )
+    with refused(r"a\.heic: HEIC needs pi-heif: pip install .*heic", MissingDependencyError):
+        read_photo(tmp_path / "a.heic")
     monkeypatch.setattr(features, "check", lambda _: False)
     (tmp_path / "a.avif").write_bytes(b"\0\0\0\x18ftypavif\0\0\0\0mif1miaf" + b"\0" * 99)
-    raises(
-        MissingDependencyError, r"a\.avif: AVIF needs Pillow 11\.3", read_photo, tmp_path / "a.avif"
-    )
+    with refused(r"a\.avif: AVIF needs Pillow 11\.3", MissingDependencyError):
+        read_photo(tmp_path / "a.avif")
 
 
 def test_kinds_are_told_by_the_brands_of_the_first_box():

@@ -9,7 +9,6 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import cad, usd
 from tests._support.meshes import load as load
-from tests._support.refusals import raises
 from tests.formats.meshes.packages import threemf
 
 
@@ -62,6 +61,7 @@ def refused(write):
 
     def check(name, content, match, **options):
         path = write(name, content)
-        raises(MeshError, match, cr.load_mesh, path, **options)
+        with pytest.raises(MeshError, match=match):
+            cr.load_mesh(path, **options)
 
     return check

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from curvireg_torch.errors import MeshError
-from tests._support.refusals import raises
+from tests._support.refusals import refused
 from tests.formats.meshes.pictures import encoded
 
 BOX = trimesh.creation.box((3.0, 2.0, 1.0))
@@ -172,7 +172,8 @@ def test_damaged_sparse_accessors_are_refused(read, changes, match):
     part = tree.part(BOX.faces)
     accessor = tree.content["accessors"][part["attributes"]["POSITION"]]
     accessor["sparse"] = {**sparse(tree, [1, 255], BOX.vertices[:2]), **changes}
-    raises(MeshError, match, read, tree)
+    with refused(match, MeshError):
+        read(tree)
 
 
 @pytest.mark.parametrize(("dtype", "largest"), [("B", 255), ("H", 65535), ("f", 1)])
@@ -274,7 +275,8 @@ def test_damaged_trees_are_refused(read, change):
         "skins": [{"joints": [0]}],
         **change,
     }
-    raises(MeshError, "cannot be read as a mesh", read, tree)
+    with refused("cannot be read as a mesh", MeshError):
+        read(tree)
 
 
 def test_parts_share_a_view_without_copies(read):
@@ -290,4 +292,5 @@ def test_parts_share_a_view_without_copies(read):
     assert len(read(tree)[0].faces) == 1000
     assert time.process_time() - start < 3.0
     tree.content["nodes"] += [{}] * 100_001
-    raises(MeshError, "more than 100,000 nodes", read, tree)
+    with refused("more than 100,000 nodes", MeshError):
+        read(tree)

@@ -12,7 +12,7 @@ from curvireg_torch.cli.options import MESH, add_options, register_options
 from curvireg_torch.errors import MeshError, MissingFileError
 from curvireg_torch.mesh import mesh_symmetries
 from tests._support.doubling import check_linear
-from tests._support.refusals import raises
+from tests._support.refusals import refused
 from tests.formats.meshes.pictures import encoded, noise
 
 POINTS = "".join(f"v {x} {y} {z}\n" for x in (0, 3) for y in (0, 2) for z in (0, 1))
@@ -210,7 +210,8 @@ def test_an_obj_of_many_parts_is_refused(tmp_path):
     for key in ("o", "g", "usemtl", "mtllib"):
         path = tmp_path / "a.obj"
         path.write_text(POINTS + "".join(f"{key} p{k}\nf 1 2 3\n" for k in range(10_001)))
-        raises(MeshError, "more than 10,000 parts; join them", cr.load_mesh, path)
+        with refused("more than 10,000 parts; join them", MeshError):
+            cr.load_mesh(path)
 
 
 def test_a_can_of_two_materials_that_look_alike_is_grey(tmp_path, write, load):
@@ -237,11 +238,7 @@ def test_options_of_the_command_line_reach_the_reader(tmp_path):
     mesh = register_options(arguments).load_mesh(path)
     assert mesh.has_colours
     arguments = parser.parse_args(["--link", "tip"])
-    raises(MeshError, "only a URDF has links", register_options(arguments).load_mesh, path)
-    raises(
-        MissingFileError,
-        "no such folder; check the folder of the textures",
-        cr.load_mesh,
-        path,
-        textures=tmp_path / "nowhere",
-    )
+    with refused("only a URDF has links", MeshError):
+        register_options(arguments).load_mesh(path)
+    with refused("no such folder; check the folder of the textures", MissingFileError):
+        cr.load_mesh(path, textures=tmp_path / "nowhere")

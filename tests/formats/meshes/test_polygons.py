@@ -9,7 +9,7 @@ from PIL import Image
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes.polygons import triangulated
-from tests._support.refusals import raises
+from tests._support.refusals import refused
 
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
 
@@ -123,11 +123,11 @@ def test_load_mesh_reads_binary_ply_of_one_number_of_corners(tmp_path):
     assert cr.load_mesh(path).surface.area == pytest.approx(2 * 7)
     # 12 corners as three quads
     path.write_bytes(binary_ply([[0, 1, 2, 3], [4, 5, 6], [7, 8, 9, 10, 11]], vertices))
-    raises(
-        MeshError, "different numbers of corners are not read; export triangles", cr.load_mesh, path
-    )
+    with refused("different numbers of corners are not read; export triangles", MeshError):
+        cr.load_mesh(path)
     path.write_bytes(binary_ply(faces, vertices))
-    raises(MeshError, "different numbers of corners: export triangles", cr.load_mesh, path)
+    with refused("different numbers of corners: export triangles", MeshError):
+        cr.load_mesh(path)
 
 
 BOX = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
@@ -155,7 +155,8 @@ def test_load_mesh_reads_every_face_of_an_obj(tmp_path, line, triangles):
 def test_load_mesh_refuses_obj_that_counts_from_0(tmp_path, face):
     path = tmp_path / "a.obj"
     path.write_text(f"{BOX}{face}\n")
-    raises(MeshError, "vertex 0; OBJ files count from 1", cr.load_mesh, path)
+    with refused("vertex 0; OBJ files count from 1", MeshError):
+        cr.load_mesh(path)
 
 
 @pytest.mark.parametrize("kind", ["off", "obj", "ply"])
@@ -170,4 +171,5 @@ def test_load_mesh_refuses_damaged_polygons(tmp_path, kind):
         if kind == "obj" and damaged == data[:-12]:
             continue  # a shorter OBJ is another OBJ
         path.write_bytes(damaged)
-        raises(MeshError, path.name, cr.load_mesh, path)
+        with refused(path.name, MeshError):
+            cr.load_mesh(path)
