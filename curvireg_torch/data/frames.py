@@ -1,23 +1,20 @@
 """Frames of a video by their number, without a copy of each on disk."""
 
+import math
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
-from threading import Lock
 
 from torch import Tensor
 
 from ..errors import ImageError
-from ..utils.threads import MAX_THREADS
 from .images import Video
 
 MAX_SHARED = 4  # videos that a process of workers keeps open
-KEPT = MAX_THREADS + 1  # frames in memory: more than there are threads that ask for them
 
 
 class FrameReader:
-    """Frames of one video, for several threads that ask for numbers nearly in order: it is decoded
-    once.
+    """Frames of one video, which is decoded once for numbers that are asked for in order.
 
     Args:
         path: of the video, see :class:`Video`.
@@ -37,10 +34,8 @@ class FrameReader:
     def __init__(self, path: Path, *, every: int = 1) -> None:
         self.path = path
         self.every = every
-        self._lock = Lock()
-        self._kept: dict[int, Tensor] = {}
         self._frames: Iterator[tuple[int, Tensor]] = iter(())
-        self._next = 0
+        self._last = math.inf  # none is open
         self._error: ImageError | None = None
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -49,24 +44,14 @@ class FrameReader:
 
     def read(self, number: int) -> Tensor:
         """(3, H, W) uint8 RGB of a frame; :class:`ImageError` if it cannot be decoded."""
-        with self._lock:
-            if number not in self._kept:
-                self._decode(number)
-            return self._kept[number]
-
-    def _decode(self, number: int) -> None:
         if self._error is not None:  # what follows a damaged frame is not decoded again for each
             raise self._error
-        if self._next == 0 or number < self._next:
+        if number <= self._last:
             self._frames = iter(Video(self.path, every=self.every))
         try:
-            for decoded, image in self._frames:
-                self._kept[decoded] = image
-                self._next = decoded + 1
-                if len(self._kept) > KEPT:
-                    del self._kept[next(iter(self._kept))]
-                if decoded == number:
-                    return
+            for self._last, image in self._frames:
+                if self._last == number:
+                    return image
         except ImageError as error:
             self._error = error
             raise

@@ -65,7 +65,7 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     """
     T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     means = [_transform(d, points).norm(dim=1).mean(1) for d in _chunks(T_est - T_gt, points)]
-    return _inf_unless(valid, torch.cat(means))
+    return torch.cat(means).where(valid, torch.inf)
 
 
 def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
@@ -85,7 +85,7 @@ def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     tree = cKDTree(model.numpy())
     back = torch.linalg.solve(T_est.detach().cpu().double(), T_gt.detach().cpu().double())
     means = [float(tree.query((model @ T[:3, :3].T + T[:3, 3]).numpy())[0].mean()) for T in back]
-    return _inf_unless(valid, torch.tensor(means, dtype=T_est.dtype, device=T_est.device))
+    return T_est.new_tensor(means).where(valid, torch.inf)
 
 
 def mssd_error(
@@ -115,7 +115,7 @@ def mssd_error(
             [_transform(d, points).norm(dim=1).amax(1) for d in _chunks(moved, points)]
         )
 
-    return _inf_unless(valid, _least_maximum(largest, difference.shape[:2], points))
+    return _least_maximum(largest, difference.shape[:2], points).where(valid, torch.inf)
 
 
 def mspd_error(
@@ -156,10 +156,11 @@ def mspd_error(
             (xy_a, front_a), (xy_b, front_b) = (
                 _project(p.flatten(0, 1)[some], points) for p in (estimated, true)
             )
-            found.append(_inf_unless(front_a & front_b, (xy_a - xy_b).norm(dim=1)).amax(1))
+            distances = (xy_a - xy_b).norm(dim=1).where(front_a & front_b, torch.inf)
+            found.append(distances.amax(1))
         return torch.cat(found)
 
-    return _inf_unless(valid, _least_maximum(largest, true.shape[:2], points))
+    return _least_maximum(largest, true.shape[:2], points).where(valid, torch.inf)
 
 
 def _least_maximum(
@@ -242,10 +243,8 @@ def _project(projections: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """(N, 3, 4) projections -> pixels (N, 2, P), and which points (N, P) are in front of the
     camera."""
     image = _transform(projections, points)
-    front = image[:, 2] > 0
-    return image[:, :2] / torch.where(front, image[:, 2], torch.ones_like(image[:, 2])).unsqueeze(
-        1
-    ), front
+    front = image[:, 2:] > 0
+    return image[:, :2] / image[:, 2:].where(front, 1.0), front[:, 0]
 
 
 def median_error(errors: Tensor) -> float:
@@ -284,7 +283,7 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
     valid = R_est.isfinite().flatten(-2).all(-1)
     plain = rotation_error(R_est, R_gt)
     symmetric = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
-    return _inf_unless(valid, torch.cat([plain.unsqueeze(-1), symmetric], -1).amin(-1))
+    return torch.cat([plain.unsqueeze(-1), symmetric], -1).amin(-1).where(valid, torch.inf)
 
 
 def _check_errors(errors: Tensor) -> None:
@@ -294,8 +293,3 @@ def _check_errors(errors: Tensor) -> None:
             f"errors: expected numbers >= 0, got {bad} that are negative or NaN; a missing "
             f"estimate counts as inf"
         )
-
-
-def _inf_unless(valid: Tensor, errors: Tensor) -> Tensor:
-    """``errors``, replaced by ``inf`` where ``valid`` is False."""
-    return torch.where(valid, errors, torch.full_like(errors, torch.inf))

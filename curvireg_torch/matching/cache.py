@@ -21,7 +21,7 @@ from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import cache_folder, tensor_digest, text_digest
 from ..utils.likes import MeshLike
-from ..utils.sources import import_digest
+from ..utils.sources import package_digest
 from .bank import FORMAT_VERSION, ViewBank, colour_arrays, views_of
 
 #: Size limit of the cache in bytes; least recently used banks are removed. $CURVIREG_CACHE_LIMIT
@@ -29,8 +29,18 @@ from .bank import FORMAT_VERSION, ViewBank, colour_arrays, views_of
 CACHE_LIMIT = 2_000_000_000
 # Age from which an incomplete file counts as the remains of a killed process
 ABANDONED_SECONDS = 3600.0
-# A bank that another version of this file, or of anything that it imports, built is not found
-_BUILDER = "matching/bank.py"
+NOT_IN_BANKS = (
+    "cli",
+    "viewer",
+    "inspection",
+    "evaluation",
+    "jobs",
+    "visualization",
+    "registration",
+    "fitting",
+)
+"""Parts of the package above this one: a bank that another version of the rest built is not
+found."""
 
 
 class CachedBank(NamedTuple):
@@ -82,7 +92,7 @@ def bank_key(
         f"views.{field.name}": getattr(views, field.name).double() for field in fields(ViewSphere)
     }
     facts = [FORMAT_VERSION, settings, mesh.up, renderer]
-    digests = [import_digest(_BUILDER), tensor_digest(tensors, size=16)]
+    digests = [package_digest(without=NOT_IN_BANKS), tensor_digest(tensors, size=16)]
     return text_digest(json.dumps([facts, digests], sort_keys=True), size=16)
 
 

@@ -32,7 +32,7 @@ from ..utils.checks import as_boxes, check_pixels
 from ..utils.computed import without_computed
 from ..utils.files import text_digest
 from ..utils.likes import BoxesLike
-from ..utils.precision import full_precision, in_full_precision
+from ..utils.precision import full_precision
 from ..utils.threads import map_on_threads
 from .bank import ViewBank, packed, views_at_a_time
 from .cells import ROUNDING_OF_TRACE, DescribedViews, best_cells
@@ -235,7 +235,7 @@ class ViewMatcher(nn.Module):
         """
         return self.rank(self.query(images, boxes))
 
-    @in_full_precision
+    @full_precision()
     def query(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing
         pixels."""
@@ -254,7 +254,7 @@ class ViewMatcher(nn.Module):
         unknown = torch.full_like(crops[:, 0, 0, 0], torch.nan)
         return self.describe(crops, unknown, box_jitter=0.0)
 
-    @in_full_precision
+    @full_precision()
     def describe(
         self, crops: Tensor, shapes: Tensor, *, box_jitter: float | None = None
     ) -> QueryFeatures:
@@ -276,7 +276,7 @@ class ViewMatcher(nn.Module):
             mask=mask,
         )
 
-    @in_full_precision
+    @full_precision()
     def rank(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:
         """Compare B described photographs with all views; errors as :meth:`forward`. ``allowed``
         (B, N) bool leaves views out, whose score is 0."""
@@ -300,7 +300,7 @@ class ViewMatcher(nn.Module):
             outside = outside.masked_fill(best == -torch.inf, -1)
         return Ranking(log.exp(), order, {**terms, **compared}, allowed, outside)
 
-    @in_full_precision
+    @full_precision()
     def similarity(self, query: QueryFeatures, allowed: Tensor | None = None) -> Tensor:
         """(B,) normalised correlation of the view that is best without the appearance term, at a
         fraction of the cost of :meth:`rank`."""
@@ -318,7 +318,7 @@ class ViewMatcher(nn.Module):
         ).sum(dim=0)
 
     @torch.no_grad()
-    @in_full_precision
+    @full_precision()
     def compare_views(self, query: QueryFeatures, views: ViewSphere) -> Tensor:
         """(N,) log scores of further views of the mesh for one described photograph, 0 for the best
         of them, by all terms but appearance; mu and Sigma of whitened descriptors are those of the
@@ -390,13 +390,13 @@ class ViewMatcher(nn.Module):
         chunks = [views[k : k + at_a_time] for k in range(0, len(views), at_a_time)]
         return torch.cat(map_on_threads(describe, chunks, device=self.bank.device))
 
-    @in_full_precision
+    @full_precision()
     def appearance_of(self, pictures: Tensor) -> Tensor:
         """(H, D) features of ``pictures`` (H, C, S, S) by the appearance term."""
         assert self._appearance is not None
         return self._appearance.describe(pictures)
 
-    @in_full_precision
+    @full_precision()
     def appearance_scores(
         self,
         query: QueryFeatures,

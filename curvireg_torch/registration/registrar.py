@@ -19,7 +19,7 @@ from ..utils.checks import check_device, check_integer, check_option, check_symm
 from ..utils.choices import MESH_KINDS
 from ..utils.executors import Workers
 from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike, MeshLike
-from ..utils.precision import in_full_precision
+from ..utils.precision import full_precision
 from .detection import detect_block
 from .photograph import OnDemand, Photograph, as_photographs
 from .refinement import refine
@@ -140,7 +140,7 @@ class Registrar(Target):
             )
 
     @torch.no_grad()
-    @in_full_precision
+    @full_precision()
     def __call__(
         self,
         images: ImagesLike,
@@ -190,7 +190,7 @@ class Registrar(Target):
         return self.register_prepared(OnDemand(located, len(items)))
 
     @torch.no_grad()
-    @in_full_precision
+    @full_precision()
     def register_prepared(self, items: Items, *, detects: bool = False) -> Results:
         """Register photographs that :func:`.as_photographs` has prepared, each to the best of
         the meshes; ``detects`` searches for the object in the whole photographs.
@@ -206,7 +206,7 @@ class Registrar(Target):
         """Return the registrar of one of several meshes, by :attr:`Registration.mesh_index`."""
         return self.others[mesh_index - 1] if mesh_index else self
 
-    @in_full_precision
+    @full_precision()
     def refine(
         self, images: ImagesLike, camera_matrices: CameraLike | None, poses: ArrayLike
     ) -> Results:

@@ -11,7 +11,7 @@ from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..evidence import Evidence
 from ..geometry.framing import border_sides, boxes_at, outside_fraction
 from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike
-from ..utils.precision import in_full_precision
+from ..utils.precision import full_precision
 from .confidence import (
     MAX_MARGIN,
     RIVAL_ANGLE,
@@ -86,7 +86,7 @@ def register_views(
 
 
 @torch.no_grad()
-@in_full_precision
+@full_precision()
 def register_prepared_views(
     target: Target, items: Sequence[Photograph | CurviregError], T_cam_from_world: ArrayLike
 ) -> Registration:

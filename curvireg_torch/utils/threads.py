@@ -101,14 +101,13 @@ def map_on_threads(
 
 
 @contextmanager
-def single_threaded_pool(workers: int | None = None) -> Iterator[ThreadPoolExecutor]:
-    """A pool of ``workers`` threads, :func:`available_threads` by default, on each of which torch
-    computes single-threaded.
+def single_threaded_pool() -> Iterator[ThreadPoolExecutor]:
+    """A pool of :func:`available_threads`, on each of which torch computes single-threaded.
 
     Operations on a few images are too short to divide. After an error, jobs that have not started
     are cancelled.
     """
-    workers = workers or available_threads()
+    workers = available_threads()
     with ThreadPoolExecutor(workers, initializer=_compute_single_threaded) as pool:
         try:
             _start(pool, workers)

@@ -56,7 +56,7 @@ def test_bank_key_depends_on_everything(monkeypatch):
     keys += [key(mesh, VIEWS[:3]), key(mesh, renderer="embree")]
     keys += [key(mesh, pipeline=Pipeline(bank=replace(PIPELINE.bank, sigma=1.5)))]
     assert key(textured().copy()) in keys
-    monkeypatch.setattr(cache, "import_digest", lambda _: "another version")
+    monkeypatch.setattr(cache, "package_digest", lambda **_: "another version")
     keys.append(key(mesh))
     assert len(set(keys)) == len(keys)
 

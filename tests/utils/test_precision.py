@@ -2,14 +2,14 @@ import pytest
 import torch
 
 from curvireg_torch.utils import threads
-from curvireg_torch.utils.precision import full_precision, in_full_precision
+from curvireg_torch.utils.precision import full_precision
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_autocast_is_off_within_and_as_before_afterwards(dtype):
     a = torch.rand(3, 3)
 
-    @in_full_precision
+    @full_precision()
     def product(x, *, y):
         """Of matrices."""
         return x @ y
