@@ -10,7 +10,6 @@ from typing import Any
 from ..errors import InvalidInputError, MissingFileError
 from ..evaluation.registry import DATASETS
 from ..jobs.options import whole_number
-from ..utils.aliases import Fields
 from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
 from ..version import __version__
@@ -80,13 +79,14 @@ def _build_bank(arguments: argparse.Namespace) -> None:
     check_output_file(arguments.out, input_files(arguments, arguments.mesh), mark=b"curvireg")
     pipeline = options.open_pipeline()
     mesh = options.load_mesh(arguments.mesh)
-    settings: Fields = {
-        "renderer": options.renderer,
-        "progress": options.progress,
-        "device": options.device,
-    }
     with one_torch_thread():
-        bank = ViewBank.build(mesh, pipeline=pipeline, **settings)
+        bank = ViewBank.build(
+            mesh,
+            pipeline=pipeline,
+            renderer=options.renderer,
+            progress=options.progress,
+            device=options.device,
+        )
     bank.save(arguments.out)
     size = arguments.out.stat().st_size / 1e6
     print(f"{arguments.out}: {len(bank)} views, {size:.1f} MB, {time.perf_counter() - start:.1f} s")
@@ -187,16 +187,19 @@ def _run_evaluation(arguments: argparse.Namespace) -> None:
     pipeline = options.open_pipeline()
     benchmark = kind.scored(kind.open(arguments.root, **kind.chosen(arguments)), protocol)
     check_writable(out)
-    how: Fields = {
-        "limit": arguments.limit,
-        "renderer": options.renderer,
-        "progress": options.progress,
-    }
     with (
         one_torch_thread(),
         opened_workers(arguments.jobs, arguments.scheduler) as workers,
     ):
-        summary = evaluate(benchmark, out, pipeline=pipeline, workers=workers, **how)
+        summary = evaluate(
+            benchmark,
+            out,
+            pipeline=pipeline,
+            limit=arguments.limit,
+            renderer=options.renderer,
+            progress=options.progress,
+            workers=workers,
+        )
     if summary["n"] == 0:
         skipped = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items())
         reasons = skipped or "no object is annotated"

@@ -3,21 +3,14 @@
 import argparse
 import json
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from ..jobs.options import whole_number
 from ..utils.choices import check_given
 from ..utils.files import write_file
 from .libraries import load_libraries
 from .options import MESH, METHOD, add_command, add_options, input_files, register_options
-
-STAGES = {
-    "mesh": ("mesh", "step"),
-    "bank": ("views", "view"),
-    "look-alikes": ("look-alikes", "direction"),
-    "photographs": ("photographs", "photograph"),
-}
-"""Name and unit of each stage's bar."""
+from .stages import shown_stages
 
 
 def add_inspect(commands: Any) -> None:
@@ -66,34 +59,6 @@ def add_inspect(commands: Any) -> None:
     add_options(parser, *MESH, *METHOD)
 
 
-class StageBars:
-    """A bar for each stage in turn, on standard error."""
-
-    def __init__(self, *, shown: bool) -> None:
-        self._shown = shown
-        self._stage = ""
-        self._bar: Any = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def report(self, stage: str, done: int, total: int) -> None:
-        """Show how much of a stage is done."""
-        from tqdm import tqdm
-
-        if stage != self._stage:
-            self.__exit__()
-            name, unit = STAGES[stage]
-            self._bar = tqdm(total=total, desc=name, unit=unit, disable=not self._shown)
-            self._stage = stage
-        self._bar.total = total
-        self._bar.update(done - self._bar.n)
-
-
 def _run_inspect(arguments: argparse.Namespace) -> int:
     """Write the report and print it."""
     check_given([], [arguments.mesh], banks=False)
@@ -107,8 +72,7 @@ def _run_inspect(arguments: argparse.Namespace) -> int:
     options = register_options(arguments)
     inputs = input_files(arguments, arguments.mesh, *backgrounds)
     with output_folder(arguments.out, "inspect", inputs=inputs):
-        with StageBars(shown=options.progress) as bars:
-            bars.report("mesh", 0, 1)
+        with shown_stages(shown=options.progress) as show:
             report = inspect(
                 options.load_mesh(arguments.mesh),
                 n=arguments.n,
@@ -119,7 +83,7 @@ def _run_inspect(arguments: argparse.Namespace) -> int:
                 device=options.device,
                 backgrounds=backgrounds,
                 clutter=arguments.clutter,
-                progress=bars.report,
+                progress=show,
             )
         content = json.dumps(report.to_dict(), indent=2) + "\n"
         write_file(arguments.out / "inspect.json", content.encode())

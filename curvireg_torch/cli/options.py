@@ -114,8 +114,13 @@ def register_options(
         raise InvalidInputError(f"--{error}") from error
     check_camera(given.get("camera"), given.get("guess"))
     check_device(given.get("device", "cpu"), "--device")
-    common: Fields = {"photos": tuple(photos), "meshes": tuple(meshes), "limits": limits}
-    options = RegisterOptions(**common, unit_is_given="unit" in given, **given)
+    options = RegisterOptions(
+        photos=tuple(photos),
+        meshes=tuple(meshes),
+        limits=limits,
+        unit_is_given="unit" in given,
+        **given,
+    )
     options.open_files()
     return options
 

@@ -5,7 +5,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -30,6 +30,7 @@ from .options import (
     numbers_among,
     register_options,
 )
+from .stages import shown_stages
 
 if TYPE_CHECKING:
     from ..jobs.lists import Counts
@@ -48,13 +49,6 @@ NOT_CALIBRATED = "not calibrated for other terms, fields or views than the defau
 TRACKERS = ("m3t", "visp")
 FORMATS = ("ros", *TRACKERS)
 OPEN_AXES = 1.0  # axes of rotation that a fit leaves undetermined, from which the advice says so
-
-STAGES = {
-    "detection": "detecting the object",
-    "bank": "rendering views",
-    "contours": "fitting contours",
-}
-"""Stages that are called otherwise than in the library."""
 
 
 def add_register(commands: Any) -> None:
@@ -239,9 +233,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.views is not None or (
         arguments.list is None and is_one_photograph(arguments.photos)
     ):
-        with _one_result(arguments):
-            reliable = _register_alone(arguments)
-        return NONE_RELIABLE if arguments.strict and not reliable else 0
+        verdict = _register_alone(arguments)
+        is_enough = not arguments.strict or verdict in ENOUGH[arguments.need or "pose"]
+        return 0 if is_enough else NONE_RELIABLE
     options = _checked_options(arguments)
     from ..utils.executors import opened_workers
     from ..utils.threads import one_torch_thread
@@ -266,13 +260,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise InvalidInputError(message, subject=arguments.list or "")
     if not arguments.strict:
         return 0
-    enough = sum(counts.verdicts.get(verdict, 0) for verdict in _enough(arguments))
-    return _strict_code(enough, len(counts.failures))
-
-
-def _enough(arguments: argparse.Namespace) -> tuple[str, ...]:
-    """The verdicts that are enough for ``--strict``."""
-    return ENOUGH[arguments.need or "pose"]
+    if not any(counts.verdicts.get(verdict) for verdict in ENOUGH[arguments.need or "pose"]):
+        return NONE_RELIABLE
+    return SOME_FAILED if counts.failures else 0
 
 
 def _checked_options(arguments: argparse.Namespace) -> "RegisterOptions":
@@ -284,21 +274,28 @@ def _checked_options(arguments: argparse.Namespace) -> "RegisterOptions":
     return register_options(arguments, arguments.photos, arguments.meshes)
 
 
-def _register_alone(arguments: argparse.Namespace) -> bool:
-    """Register one photograph or rig; returns whether the result is reliable."""
-    options = _checked_options(arguments)
-    from ..utils.threads import one_torch_thread
+def _register_alone(arguments: argparse.Namespace) -> str:
+    """Register one photograph or rig; returns the verdict. An older result goes first."""
+    from ..jobs.outputs import output_folder
 
-    with one_torch_thread():
+    with ExitStack() as stack:
+        if arguments.out is not None:
+            named = input_files(arguments, *arguments.photos, *arguments.meshes)
+            inputs = chain(named, _photographs_of_rig(arguments))
+            stack.enter_context(output_folder(arguments.out, "register", inputs=inputs))
+        options = _checked_options(arguments)
+        from ..utils.threads import one_torch_thread
+
+        stack.enter_context(one_torch_thread())
         register = _register_one if arguments.views is None else _register_rig
-        return register(options, arguments)
+        document = register(options, arguments)
+        if arguments.json:
+            from ..jobs.store import to_json
 
-
-def _strict_code(reliable: int, failed: int) -> int:
-    """The exit code of ``--strict`` for numbers of photographs."""
-    if not reliable:
-        return NONE_RELIABLE
-    return SOME_FAILED if failed else 0
+            print(to_json(document), end="")
+        else:
+            print_result(document, arguments.out)
+    return str(document["verdict"])
 
 
 @contextmanager
@@ -311,20 +308,6 @@ def _output(arguments: argparse.Namespace) -> Iterator[Path]:
         yield Path(folder)
 
 
-@contextmanager
-def _one_result(arguments: argparse.Namespace) -> Iterator[None]:
-    """Context in which the files of one result may be written; an older one goes first."""
-    if arguments.out is None:
-        yield
-        return
-    from ..jobs.outputs import output_folder
-
-    named = input_files(arguments, *arguments.photos, *arguments.meshes)
-    inputs = chain(named, _photographs_of_rig(arguments))
-    with output_folder(arguments.out, "register", inputs=inputs):
-        yield
-
-
 def _photographs_of_rig(arguments: argparse.Namespace) -> Iterator[Path]:
     """The photographs of a rig that can be read."""
     if arguments.views is None:
@@ -335,8 +318,8 @@ def _photographs_of_rig(arguments: argparse.Namespace) -> Iterator[Path]:
         yield from (view.photo for view in read_rig(arguments.views, arguments.meshes[0]))
 
 
-def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
-    """Register one photograph, write and print the result; returns whether it is reliable."""
+def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> Document:
+    """Register one photograph and write the result; returns its document."""
     from ..jobs.entry import entry_of, prepare
     from ..jobs.photograph import register_entry
     from ..jobs.result_files import write_lost
@@ -374,13 +357,11 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
         remarks.append(f"--pose upright: {axis} of the mesh is taken as up; --up names another")
     if remarks:  # with --json, standard output holds only the result
         print(f"{path}: {'; '.join(remarks)}", file=sys.stderr if arguments.json else sys.stdout)
-    _finish(arguments, found.document)
-    return found.document["verdict"] in _enough(arguments)
+    return found.document
 
 
-def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
-    """Register the photographs of a rig together, write and print the result; returns whether it is
-    reliable."""
+def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> Document:
+    """Register the photographs of a rig together and write the result; returns its document."""
     from ..jobs.photograph import prepare_views
     from ..jobs.result_files import write_views
     from ..jobs.rigs import read_rig, register_rig
@@ -401,8 +382,7 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
         print("pose in the world (model to world)")
         for view in document["photographs"]:
             print(f"{view['name']}: {view_in_words(view)}")
-    _finish(arguments, document)
-    return result.verdict in _enough(arguments)
+    return document
 
 
 def _write_pose(arguments: argparse.Namespace, document: Fields, registrar: "Registrar") -> None:
@@ -423,16 +403,6 @@ def _write_pose(arguments: argparse.Namespace, document: Fields, registrar: "Reg
                 "curvireg: no pose_with_covariance.yaml, as this pose has no covariance",
                 file=sys.stderr,
             )
-
-
-def _finish(arguments: argparse.Namespace, document: Fields) -> None:
-    """Print the result."""
-    from ..jobs.store import to_json
-
-    if arguments.json:
-        print(to_json(document), end="")
-    else:
-        print_result(document, arguments.out)
 
 
 def _register_several(
@@ -471,15 +441,16 @@ def _register_several(
         "field": None if options.network is None else field_digest(options.network),
         **{name: getattr(options, name) for name in names},
     }
-    how: Fields = {
-        "settings": settings,
-        "textures": [] if options.textures is None else [options.textures],
-        "progress": options.progress,
-        "source": source,
-        "workers": workers,
-    }
     return register_list(
-        photos, out, partial(open_registrar, options), inputs=input_files(arguments), **how
+        photos,
+        out,
+        partial(open_registrar, options),
+        inputs=input_files(arguments),
+        source=source,
+        settings=settings,
+        textures=[] if options.textures is None else [options.textures],
+        progress=options.progress,
+        workers=workers,
     )
 
 
@@ -643,22 +614,11 @@ def _suspicious_box(inputs: Document) -> str:
 def opened_registrar(options: "RegisterOptions") -> "Iterator[tuple[Registrar, float]]":
     """The registrar of the options' meshes, and the seconds that it took to open. A terminal shows
     its stages."""
-    from tqdm import tqdm
-
     from ..jobs.opening import open_registrar
 
-    # None: where there is no terminal
     start = time.perf_counter()
-    disable = None if options.progress else True
-    with tqdm(bar_format="{desc}", leave=False, disable=disable) as bar:
-
-        def show(stage: str, count: int, of: int) -> None:
-            name = STAGES.get(stage, stage)
-            bar.set_description_str(f"{name} {count} of {of}" if of > 1 else name)
-
-        show("reading the mesh", 0, 1)
-        registrar = open_registrar(
-            options, options.meshes, progress=show if options.progress else None
-        )
-        registrar.progress = show if options.progress else False
+    with shown_stages(shown=options.progress) as show:
+        progress = show if options.progress else None
+        registrar = open_registrar(options, options.meshes, progress=progress)
+        registrar.progress = progress or False
         yield registrar, time.perf_counter() - start

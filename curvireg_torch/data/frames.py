@@ -49,8 +49,9 @@ class FrameReader:
         if number <= self._last:
             self._frames = iter(Video(self.path, every=self.every))
         try:
-            for self._last, image in self._frames:
-                if self._last == number:
+            for decoded, image in self._frames:
+                self._last = decoded
+                if decoded == number:
                     return image
         except ImageError as error:
             self._error = error

@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInputError
 from ..jobs.outputs import output_folder
 from ..jobs.runner import results_digest, run_entries, thumbnail_of
 from ..jobs.store import ResultStore, Row, has_pose, to_json
@@ -66,7 +65,7 @@ def evaluate(
         The summary, as written to ``summary.json``.
 
     Raises:
-        InvalidInputError: a bad limit, or a folder that holds the results of a list.
+        InvalidInputError: a bad limit, or a folder that holds other results.
 
     Example:
         >>> from curvireg_torch.data import Pascal3DPlus
@@ -81,10 +80,6 @@ def evaluate(
     pipeline = pipeline.with_boxes(benchmark.protocol.box_is)
     if limit is not None:
         check_positive(limit, "limit")
-    if (out / "results.csv").exists():
-        raise InvalidInputError(
-            f"{out}: holds the results of a list; choose another folder", kind="out"
-        )
     # all that results depend on besides their files; --limit and --categories only select objects
     settings = {
         **benchmark.settings(),
@@ -98,21 +93,27 @@ def evaluate(
 
     # Without cameras, the datasets have meshes of similar objects.
     mesh_is = "exact" if benchmark.gives_camera else "similar"
-    opened: Row = {"pipeline": pipeline, "renderer": renderer, "mesh_is": mesh_is}
-    open_registrar = partial(_open_registrar, unit=benchmark.unit, **opened)
-    entries = [
-        entry for i in benchmark.selection(limit) if not (entry := benchmark.entries[i]).error
-    ]
-    how: Row = {
-        "settings": settings,
-        "label": benchmark.name,
-        "progress": progress,
-        "workers": workers,
-    }
+    open_registrar = partial(
+        _open_registrar,
+        unit=benchmark.unit,
+        pipeline=pipeline,
+        renderer=renderer,
+        mesh_is=mesh_is,
+    )
+    chosen = [benchmark.entries[i] for i in benchmark.selection(limit)]
+    entries = [entry for entry in chosen if not entry.error]
     files = chain.from_iterable(entry.files for entry in entries)
     source = ["{dataset} {root} {split}".format_map(settings)]
     with output_folder(out, "evaluate", inputs=files, source=source):
-        store = run_entries(entries, out, open_registrar, **how)
+        store = run_entries(
+            entries,
+            out,
+            open_registrar,
+            settings=settings,
+            label=benchmark.name,
+            progress=progress,
+            workers=workers,
+        )
         store.sort([entry.key for entry in entries])
         return report(benchmark, store, settings, limit)
 

@@ -22,10 +22,9 @@ from ..errors import (
     InvalidInputError,
     MissingFileError,
 )
-from ..geometry import Camera, camera_matrix
+from ..geometry import Camera
 from ..registration.confidence import two_decimals
 from ..utils.choices import IMAGES, VIDEOS, pattern_of
-from ..utils.executors import Workers
 from ..utils.files import FindFile, found_in, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet
 from ..visualization.words import verdict_counts
@@ -80,7 +79,7 @@ def _entry(
             raise InvalidInputError("mesh: empty, and no MESH was given; name one")
         numbers = numbers_of(values, BOX)
         box = None if numbers is None else options.box_of(find(values["photo"]), numbers)
-        camera = _given_camera(values, find, calibrations) or options.guess
+        camera = given_camera(values, find, calibrations) or options.guess
         mask = find(values["mask"]) if values.get("mask") else None
         own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
         prior = prior_from_limits({**(options.limits or {}), **own})
@@ -90,18 +89,11 @@ def _entry(
     return Entry(shown, values["photo"], photo, meshes, box, camera, mask, options.instances, prior)
 
 
-def camera_of(
-    values: Mapping[str, str], find: FindFile, calibrations: Calibrations
-) -> Camera | None:
-    """The camera of a row: of numbers, or of a calibration that ``find`` finds by its name."""
-    given = _given_camera(values, find, calibrations)
-    return Camera(camera_matrix(*given)) if isinstance(given, tuple) else given
-
-
-def _given_camera(
+def given_camera(
     values: Mapping[str, str], find: FindFile, calibrations: Calibrations
 ) -> Camera | tuple[float, ...] | None:
-    """A calibration, or fx, fy, cx, cy: of a long list, cameras are made when they are needed."""
+    """The camera of a row: a calibration that ``find`` finds by its name, or fx, fy, cx, cy; of a
+    long list, cameras of these are made when they are needed."""
     numbers = numbers_of(values, CAMERA)
     if not values.get("camera"):
         return numbers
@@ -136,15 +128,9 @@ def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]
     by a folder and a pattern, counts once: no two share a name. ``every`` n-th frame of videos is
     taken. Errors are those of :func:`find_photographs`, and of :class:`.Video`.
     """
-    fours = (
-        (BOX, options.box),
-        (CAMERA, None if isinstance(options.camera, Camera) else options.camera),
-    )
-    numbers = {
-        name: str(v)
-        for names, four in fours
-        for name, v in zip(names, four or [""] * 4, strict=True)
-    }
+    camera = None if isinstance(options.camera, Camera) else options.camera
+    numbers = [*(options.box or [""] * 4), *(camera or [""] * 4)]
+    cells = dict(zip((*BOX, *CAMERA), map(str, numbers), strict=True))
     entries = []
     for path in options.photos:
         if is_video(path):
@@ -156,7 +142,7 @@ def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]
         else:
             entries += [_entry_of(photo, options) for photo in find_photographs(path)]
     different = {entry.name: entry for entry in entries}
-    return [replace(entry, cells={"photo": name, **numbers}) for name, entry in different.items()]
+    return [replace(entry, cells={"photo": name, **cells}) for name, entry in different.items()]
 
 
 def _entry_of(photo: Path, options: RegisterOptions) -> Entry:
@@ -251,11 +237,6 @@ class Counts:
         """Number of rows with a pose."""
         return sum(self.verdicts.values()) - len(self.failures)
 
-    @property
-    def reliable(self) -> int:
-        """Number of rows with a reliable pose."""
-        return self.verdicts.get("reliable", 0)
-
     def __str__(self) -> str:
         total = sum(self.verdicts.values())
         return f"{total} photographs: {verdict_counts(self.verdicts)}"
@@ -266,35 +247,21 @@ def register_list(
     out: Path,
     open_registrar: OpenRegistrar,
     *,
-    settings: Mapping[str, Any],
-    textures: Sequence[Path] = (),
-    progress: bool = True,
     inputs: Sequence[Path] = (),
     source: Sequence[str] = (),
-    workers: Workers | None = None,
+    **how: Any,
 ) -> Counts:
     """Register the photographs of a list; ``out`` gets ``results.jsonl``, ``results.csv`` and
     ``index.html``.
 
     A second call registers only what is new or has changed, see :func:`.runner.run_entries`, whose
-    arguments and errors are the same. ``inputs`` are files besides those of the entries, and
+    further arguments are ``how``. ``inputs`` are files besides those of the entries, and
     ``source`` is what the entries are of, see :func:`.outputs.output_folder`.
     """
     usable = list({entry.key: entry for entry in entries if not entry.error}.values())
-    if (out / "summary.json").exists():
-        raise InvalidInputError(
-            f"{out}: holds the evaluation of a dataset; choose another folder", kind="out"
-        )
     files = chain(inputs, chain.from_iterable(entry.files for entry in usable))
-    how: dict[str, Any] = {
-        "settings": settings,
-        "textures": textures,
-        "label": "register",
-        "progress": progress,
-        "workers": workers,
-    }
     with output_folder(out, "register several", inputs=files, source=source):
-        store = run_entries(usable, out, open_registrar, **how)
+        store = run_entries(usable, out, open_registrar, label="register", **how)
         asked = {entry.name for entry in entries}
         if removed := sum(photo not in asked for photo in store.photos()):
             text = f"{out}: {removed} results of photographs that are not asked for any more go"

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..errors import BankError
 from .options import RegisterOptions
@@ -38,8 +38,13 @@ def open_registrar(
         pipeline = pipeline.with_boxes(options.box_is)
     if options.hypotheses is not None:
         pipeline = replace(pipeline, hypotheses=options.hypotheses)
-    settings: dict[str, Any] = {"renderer": options.renderer, "mesh_is": options.mesh_is}
-    return Registrar(banks, pipeline=pipeline, field=options.network, **settings)
+    return Registrar(
+        banks,
+        pipeline=pipeline,
+        field=options.network,
+        renderer=options.renderer,
+        mesh_is=options.mesh_is,
+    )
 
 
 def _open_bank(

@@ -6,6 +6,7 @@ import os
 import re
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..data.bop import bop_box, entry_at
 from ..data.cameras import Calibrations
 from ..errors import MAX_RIG_VIEWS, CurviregError, InvalidInputError, MissingFileError
-from ..geometry import Camera
+from ..geometry import Camera, camera_matrix
 from ..geometry.cameras import transform
 from ..registration import Registrar, Registration
 from ..registration.photograph import Photograph
@@ -24,7 +25,7 @@ from ..utils.checks import check_pose
 from ..utils.files import FindFile, check_table_size, finite_numbers, found_in, read_csv, read_json
 from .documents import result_document
 from .entry import Entry
-from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, numbers_of
+from .lists import BOX, CAMERA, POSE_COLUMNS, given_camera, numbers_of
 from .photograph import register_views
 
 ROTATION = POSE_COLUMNS[:9]
@@ -47,64 +48,65 @@ def read_rig(path: Path, mesh: Path | None = None, *, find: FindFile | None = No
     """
     folder = path if path.is_dir() else path.parent
     find = find or found_in(folder)
-    if path.is_dir():
-        if (path / "images.txt").is_file():
-            return _checked(path, _colmap(path, find))
-        if (path / "scene_camera.json").is_file():
-            return _checked(path, _bop(path, mesh, find))
-        raise InvalidInputError(
-            "a folder without images.txt (COLMAP) or scene_camera.json (BOP)", subject=path
-        )
-    if not path.is_file():
-        raise MissingFileError("no such file; check the path of the rig", subject=path)
-    if path.name == "images.txt":
-        return _checked(path, _colmap(folder, find))
-    return _checked(path, _table(read_csv(path), find))
-
-
-def _checked(path: Path, rows: Iterator[Entry]) -> list[Entry]:
-    """The rows, whose errors name the file."""
-    try:
+    with _about(path):
+        if not path.exists():
+            raise MissingFileError("no such file; check the path of the rig")
+        if path.name == "images.txt" or (folder == path and (path / "images.txt").is_file()):
+            rows = _colmap(folder, find)
+        elif path.is_file():
+            rows = _table(read_csv(path), find)
+        elif (path / "scene_camera.json").is_file():
+            rows = _bop(path, mesh, find)
+        else:
+            raise InvalidInputError(
+                "a folder without images.txt (COLMAP) or scene_camera.json (BOP)"
+            )
         views = list(islice(rows, MAX_RIG_VIEWS + 1))
-    except CurviregError as error:
-        raise error.with_subject(f"{path}: {error.subject}") from error
-    if not views:
-        raise InvalidInputError("no photographs", subject=path)
-    if len(views) > MAX_RIG_VIEWS:
-        raise InvalidInputError(
-            f"more than {MAX_RIG_VIEWS:,} photographs; leave some out", subject=path
-        )
+        if not views:
+            raise InvalidInputError("no photographs")
+        if len(views) > MAX_RIG_VIEWS:
+            raise InvalidInputError(f"more than {MAX_RIG_VIEWS:,} photographs; leave some out")
     return views
 
 
+@contextmanager
+def _about(subject: object) -> Iterator[None]:
+    """Context whose errors name this subject, before their own."""
+    try:
+        yield
+    except CurviregError as error:
+        own = "" if error.subject == str(subject) else error.subject
+        raise error.with_subject(": ".join(filter(None, (str(subject), own)))) from error
+
+
 def _view(
-    name: str, photo: Path, box: Any, camera: Camera | None, rotation: Any, translation: Any
+    name: str,
+    photo: Path,
+    box: Any,
+    camera: Camera | Sequence[float] | None,
+    rotation: Any,
+    translation: Any,
 ) -> Entry:
     """A row; ``rotation`` are 9 numbers, or 4 of a quaternion."""
-    try:
-        numbers = finite_numbers(rotation, 9) or finite_numbers(rotation, 4)
-        t = finite_numbers(translation, 3)
-        if numbers is None or t is None:
-            raise InvalidInputError(
-                f"a rotation and a translation are needed; expected columns {COLUMNS}"
-            )
-        if camera is None:
-            raise InvalidInputError("expected fx fy cx cy, or camera (a calibration file)")
-        R = torch.tensor(numbers, dtype=torch.float64)
-        if len(numbers) == 4 and abs(float(R.norm()) - 1.0) > 1e-2:
+    numbers = finite_numbers(rotation, 9) or finite_numbers(rotation, 4)
+    t = finite_numbers(translation, 3)
+    if numbers is None or t is None:
+        raise InvalidInputError(
+            f"a rotation and a translation are needed; expected columns {COLUMNS}"
+        )
+    if camera is None:
+        raise InvalidInputError("expected fx fy cx cy, or camera (a calibration file)")
+    R = torch.tensor(numbers, dtype=torch.float64)
+    if len(numbers) == 4:
+        if abs(float(R.norm()) - 1.0) > 1e-2:
             raise InvalidInputError(
                 f"expected qw qx qy qz of length 1, got {float(R.norm()):.3g}; check their order"
             )
-        R = (
-            R.view(3, 3)
-            if len(numbers) == 9
-            else torch.from_numpy(Rotation.from_quat(R.roll(-1).numpy()).as_matrix())
-        )
-        T = transform(R, torch.tensor(t, dtype=torch.float64))
-        check_pose(T, "the camera's pose")
-        return Entry(name=name, photo=photo, box=box, camera=camera, T_cam_from_world=T)
-    except CurviregError as error:
-        raise InvalidInputError(str(error), subject=name) from error
+        R = torch.from_numpy(Rotation.from_quat(R.roll(-1).numpy()).as_matrix())
+    T = transform(R.view(3, 3), torch.tensor(t, dtype=torch.float64))
+    check_pose(T, "the camera's pose")
+    known = camera if isinstance(camera, Camera) else Camera(camera_matrix(*camera))
+    return Entry(name=name, photo=photo, box=box, camera=known, T_cam_from_world=T)
 
 
 def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[Entry]:
@@ -117,37 +119,33 @@ def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[Entry]:
     calibrations = Calibrations()
     for number, values in enumerate(rows, start=1):
         row = dict(zip(names, map(str.strip, values), strict=False))
-        name = f"row {number}: {row.get('photo', '')}"
-        if not row.get("photo"):
-            raise InvalidInputError(
-                f"no photo; expected columns {COLUMNS}", subject=f"row {number}"
-            )
-        if beyond := [cell for cell in values[len(names) :] if cell.strip()]:
-            raise InvalidInputError(
-                f"{beyond[0][:40]!r} is beyond the last column; quote texts with commas",
-                subject=name,
-            )
-        try:
+        photo = row.get("photo", "")
+        name = f"row {number}: {photo}"
+        with _about(name if photo else f"row {number}"):
+            if not photo:
+                raise InvalidInputError(f"no photo; expected columns {COLUMNS}")
+            if beyond := [cell for cell in values[len(names) :] if cell.strip()]:
+                raise InvalidInputError(
+                    f"{beyond[0][:40]!r} is beyond the last column; quote texts with commas"
+                )
             box = numbers_of(row, BOX)
-            camera = camera_of(row, find, calibrations)
+            camera = given_camera(row, find, calibrations)
             matrix = numbers_of(row, ROTATION)
             quaternion = numbers_of(row, QUATERNION)
             if matrix and quaternion:
                 raise InvalidInputError("r11 to r33 and qw to qz; give one of them")
-            rotation = matrix or quaternion
-            translation = numbers_of(row, TRANSLATION)
-        except CurviregError as error:
-            raise error.with_subject(": ".join(filter(None, (name, error.subject)))) from error
-        yield _view(name, find(row["photo"]), box, camera, rotation, translation)
+            pose = matrix or quaternion, numbers_of(row, TRANSLATION)
+            yield _view(name, find(photo), box, camera, *pose)
 
 
 def _colmap(folder: Path, find: FindFile) -> Iterator[Entry]:
     """Photographs of ``images.txt`` that lie in the folder, in ``images`` in it, or beside it."""
     check_table_size(folder / "images.txt")
-    try:
-        lines = (folder / "images.txt").read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise InvalidInputError(f"not text ({error})", subject="images.txt") from error
+    with _about("images.txt"):
+        try:
+            lines = (folder / "images.txt").read_text(encoding="utf-8").splitlines()
+        except UnicodeDecodeError as error:
+            raise InvalidInputError(f"not text ({error})") from error
     calibrations = Calibrations()
     for line in _without_points([line for line in lines if not line.startswith("#")]):
         words = line.split(maxsplit=9)
@@ -159,13 +157,17 @@ def _colmap(folder: Path, find: FindFile) -> Iterator[Entry]:
             message = f"expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line[:60]!r}"
             raise InvalidInputError(message, subject="images.txt")
         name = words[9].rstrip()
-        places = [find(name)]
-        places += [
-            find(str(place / "images" / name)) for place in (folder, *folder.resolve().parents[:3])
-        ]
-        photo = next(filter(os.path.isfile, places), places[0])
+        beside = (folder, *folder.resolve().parents[:3])
+        photo = _first_file([name, *(str(place / "images" / name) for place in beside)], find)
         camera = calibrations.load(f"{folder / 'cameras.txt'}:{words[8]}")
-        yield _view(f"image {name}", photo, None, camera, pose[:4], pose[4:])
+        with _about(f"image {name}"):
+            yield _view(f"image {name}", photo, None, camera, pose[:4], pose[4:])
+
+
+def _first_file(names: Sequence[str], find: FindFile) -> Path:
+    """The first of the named files that exists, else the first one."""
+    paths = list(map(find, names))
+    return next(filter(os.path.isfile, paths), paths[0])
 
 
 def _without_points(lines: Sequence[str]) -> Iterator[str]:
@@ -201,38 +203,40 @@ def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[Entry]:
     )
     number = re.search(r"obj_(\d+)$", mesh.stem) if mesh is not None else None
     for key, camera in cameras.items():
-        numbers = dict.fromkeys((key.zfill(6), key.zfill(4), key))
-        ends = [f"{number}{end}" for number in numbers for end in (".png", ".jpg", ".tif")]
-        names = [f"{kind}/{end}" for kind in ("rgb", "gray") for end in ends]
-        pictures = list(map(find, names))
-        photo = next(filter(os.path.isfile, pictures), pictures[0])
-        values = camera if isinstance(camera, dict) else {}
-        K = finite_numbers(values.get("cam_K"), 9)
-        if K is None:
-            raise InvalidInputError(
-                "no cam_K of 9 numbers in scene_camera.json", subject=f"image {key}"
-            )
-        objects = truths.get(key, [])
-        if not isinstance(objects, list) or not all(isinstance(one, dict) for one in objects):
-            raise InvalidInputError(
-                "expected a list of objects in scene_gt.json", subject=f"image {key}"
-            )
-        mine = [
-            k for k, one in enumerate(objects) if number and one.get("obj_id") == int(number[1])
-        ]
-        box = bop_box(entry_at(infos.get(key), mine[0]).get("bbox_obj")) if len(mine) == 1 else None
-        if "cam_R_w2c" not in values:
-            raise InvalidInputError(
-                "no cam_R_w2c in scene_camera.json, the pose of the camera in the world, which a "
-                "rig needs; register these photographs one by one, or write the poses in a CSV",
-                subject=f"image {key}",
-            )
-        pose = values["cam_R_w2c"], values.get("cam_t_w2c")
-        try:
-            camera_of_image = Camera(torch.tensor(K, dtype=torch.float64).view(3, 3))
-        except InvalidInputError as error:  # skew, for instance
-            raise error.with_subject(f"image {key}: cam_K in scene_camera.json") from error
-        yield _view(f"image {key}", photo, box, camera_of_image, *pose)
+        name = f"image {key}"
+        with _about(name):
+            values = camera if isinstance(camera, dict) else {}
+            K = finite_numbers(values.get("cam_K"), 9)
+            if K is None:
+                raise InvalidInputError("no cam_K of 9 numbers in scene_camera.json")
+            objects = truths.get(key, [])
+            if not isinstance(objects, list) or not all(isinstance(one, dict) for one in objects):
+                raise InvalidInputError("expected a list of objects in scene_gt.json")
+            mine = [
+                k for k, one in enumerate(objects) if number and one.get("obj_id") == int(number[1])
+            ]
+            known = entry_at(infos.get(key), mine[0]) if len(mine) == 1 else {}
+            if "cam_R_w2c" not in values:
+                raise InvalidInputError(
+                    "no cam_R_w2c in scene_camera.json, the pose of the camera in the world, which "
+                    "a rig needs; register these photographs one by one, or write the poses in a "
+                    "CSV"
+                )
+            with _about("cam_K in scene_camera.json"):  # of skew, for instance
+                pinhole = Camera(torch.tensor(K, dtype=torch.float64).view(3, 3))
+            pose = values["cam_R_w2c"], values.get("cam_t_w2c")
+            photo = _first_file(_names_in_bop(key), find)
+            yield _view(name, photo, bop_box(known.get("bbox_obj")), pinhole, *pose)
+
+
+def _names_in_bop(key: str) -> list[str]:
+    """What the picture of an image's number may be called in a scene."""
+    return [
+        f"{kind}/{number}{end}"
+        for kind in ("rgb", "gray")
+        for number in dict.fromkeys((key.zfill(6), key.zfill(4), key))
+        for end in (".png", ".jpg", ".tif")
+    ]
 
 
 def register_rig(
@@ -246,10 +250,8 @@ def register_rig(
     """Register the ``photographs`` of a rig together, see :meth:`.Registrar.register_views`; an
     error is why one cannot be used. Returns the registration and its document."""
     start = time.perf_counter()
-    try:
+    with _about(path):
         result = register_views(rig, photographs, registrar)
-    except CurviregError as error:
-        raise InvalidInputError(f"{error}", subject=path) from error
     document = result_document(
         result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}
     )

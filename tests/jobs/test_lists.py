@@ -99,12 +99,6 @@ def test_results_of_photographs_that_a_list_no_longer_names_go(registrar, entry,
         register_rows(rows[:1], tmp_path / "out", registrar)
 
 
-def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp_path):
-    (tmp_path / "summary.json").write_text("{}")
-    with refused("holds the evaluation of a dataset"):
-        register_rows([entry], tmp_path, registrar)
-
-
 def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
     """Of a Latin-1 archive, for instance; they are written with their bytes in hexadecimal."""
     folder = tmp_path / "old"

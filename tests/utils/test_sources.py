@@ -40,7 +40,8 @@ def test_the_digest_depends_on_names(package):
     assert before != digest()
 
 
-def test_what_does_not_exist_is_refused(package):
+@pytest.mark.usefixtures("package")
+def test_what_does_not_exist_is_refused():
     with pytest.raises(FileNotFoundError, match="viewer"):
         package_digest(without=("viewer",))
 
