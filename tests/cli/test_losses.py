@@ -77,6 +77,20 @@ def test_register_overwrites_no_input(folder, register_one, register, refused, t
     assert {path: path.read_bytes() for path in out.iterdir()} == before
 
 
+def test_a_second_list_does_not_remove_the_rows_of_the_first(folder, register, refused, tmp_path):
+    out = tmp_path / "out"
+    rows = [[f"photos/{seed}.png", *box_of(seed)] for seed in (0, 1)]
+    header = "photo,x0,y0,x1,y1"
+    first, second = (written(folder / f"{k}.csv", header, row) for k, row in enumerate(rows))
+    with output_folder(out, "register several", source=[str(first.resolve())]):
+        (out / "index.html").write_text("rows")
+    bank = folder / "truck.safetensors"
+    lost = "0.csv, which would be lost"
+    refused(register("--list", second, bank), "out/index.html: holds results of", lost)
+    refused(register(*(folder / row[0] for row in rows), bank), lost)
+    assert (out / "index.html").read_text() == "rows"
+
+
 def test_demo_plot_and_bank_overwrite_no_file_of_others(folder, refused, tmp_path):
     for name in ("mesh.ply", "photo.png", "plot.png", "plot.svg", "bank.safetensors"):
         (tmp_path / name).write_text("of others")

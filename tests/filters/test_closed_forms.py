@@ -202,3 +202,14 @@ def test_edge_blur_in_all_directions(angle, mode, blur):
     estimates = filters.edge_blur(edge[None, None], mode=mode)[0, :, 40, 40]
     assert estimates.tolist() == pytest.approx([blur] * 4, rel=0.015)
     assert (estimates > 0.999 * blur).all()  # the focus 1/s does not exceed 1/blur
+
+
+def test_multiscale_focus_curves_leave_weak_edges_out():
+    """Of a tenth of the strongest edge's contrast, not of a quarter: CS is a square."""
+    x, _ = grid(161)
+    image = sum(
+        contrast * torch.erf((x - middle) / (2.0 * math.sqrt(2.0)))
+        for middle, contrast in ((-50.0, 0.3), (0.0, 0.075), (50.0, 0.03))
+    )
+    field = filters.multiscale_focus_curves(0.5 + image[None, None])[0, :, 80].norm(dim=0)
+    assert (field[[30, 80, 130]] > 0).tolist() == [True, True, False]

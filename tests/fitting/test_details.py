@@ -102,7 +102,7 @@ SHARED = line(0.0, 20)
     [
         (0, 0.0),
         (5, 0.0),  # too few to look different
-        (8, 10.0 * 8 * 0.4 / 16),  # half of their weight
+        (6, 10.0 * 6 * 0.4 / 16),  # in proportion to their full weight
         (20, 10.0 * 0.4),
     ],
 )

@@ -245,6 +245,24 @@ def test_names_are_in_the_order_of_their_numbers(tmp_path):
     assert find_photographs(tmp_path / "none.png") == [tmp_path / "none.png"]
 
 
+def test_the_page_of_a_list_begins_with_the_surest_answers(tmp_path, monkeypatch):
+    pose = {"rotation": eye(3).tolist(), "translation": None, "warnings": [], "message": ""}
+    pose |= {"digests": {"request": "r", "photo": "p"}, "verdict": "unsure", "reliable": False}
+    rows = {
+        "unlikely": {**pose, "confidence": 0.1},
+        "failed": {**pose, "verdict": "failed", "message": "no such file"},
+        "likely": {**pose, "confidence": 0.95},
+        "sure": {**pose, "confidence": 0.92, "reliable": True},
+        "surer": {**pose, "confidence": 0.99, "reliable": True},
+    }
+    shown = []
+    monkeypatch.setattr(lists, "write_sheet", lambda _, __, entries, **___: shown.extend(entries))
+    entries = [Entry({"photo": name}, name, label=name) for name in rows]
+    lists._write_tables(entries, tmp_path, Mock(read=rows.get))
+    in_order = [one.name for one in sorted(shown, key=lambda one: one.rank)]
+    assert in_order == ["surer", "sure", "likely", "unlikely", "failed"]
+
+
 def test_every_copy_of_the_object_has_a_row_and_is_drawn(registrar, entry, tmp_path, monkeypatch):
     image, boxes = two_trucks()
     write_photo(tmp_path / "two.png", image)

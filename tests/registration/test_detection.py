@@ -3,13 +3,14 @@
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import pytest
 import torch
 import torch.nn.functional as F
 
 import curvireg_torch as cr
-from curvireg_torch.errors import LostObjectError
+from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import (
     PosePrior,
     box_iou,
@@ -331,17 +332,61 @@ def test_smallest_size(shape, least):
     assert 80.0 / max(scales) == pytest.approx(least)
 
 
+def box_at(x0, score, confidence=None):
+    """One of 10 px whose registration has a confidence."""
+    box = torch.tensor([x0, 0.0, x0 + 10.0, 10.0])
+    registration = SimpleNamespace(confidence=confidence)
+    return RegisteredBox(0, box, 1.0, None, score, registration=registration)
+
+
 @pytest.mark.parametrize(("score", "kept"), [(0.2, [0.9, 0.3]), (0.5, [0.9, 0.3]), (0.95, [0.95])])
 def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_each(score, kept):
-    def at(x0, score):
-        box = torch.tensor([x0, 0.0, x0 + 10.0, 10.0])
-        return RegisteredBox(0, box, 1.0, None, score, registration=None)
-
-    found = [at(0.0, 0.9), at(5.0, 0.3)]
-    _add(found, at(2.0, score))
+    found = [box_at(0.0, 0.9), box_at(5.0, 0.3)]
+    _add(found, box_at(2.0, score))
     assert [one.score for one in found] == kept
-    _add(found, at(40.0, 0.1))  # elsewhere
+    _add(found, box_at(40.0, 0.1))  # elsewhere
     assert [one.score for one in found] == [*kept, 0.1]
+
+
+def test_boxes_around_poses_are_registered_where_they_are_more_certain(monkeypatch):
+    """Nothing supports a pose whose box lies outside the photograph."""
+    ones = [box_at(0.0, 0.5) for _ in range(3)]
+    again = [box_at(1.0, 0.49), InvalidInputError("outside"), box_at(1.0, 0.51)]
+    other = box_at(2.0, 0.6)
+    asked = []
+    monkeypatch.setattr(detection_module, "_scored", lambda *_: again)
+    monkeypatch.setattr(
+        detection_module, "_registered", lambda *args: asked.append(args[2]) or [other]
+    )
+    kept, outside, better = detection_module._refined(None, {}, ones)
+    assert kept is ones[0]
+    assert outside.score == 0.0
+    assert better is other
+    assert asked == [[again[2]]]
+
+
+def test_places_of_one_object_leave_room_for_others(monkeypatch):
+    """The first two lead to one object, and a third takes the place of the second; the most
+    probable object comes first."""
+    boxes = torch.cat([box_at(20.0 * k, 0.0).box[None] for k in range(4)])
+    there = {9.0: box_at(0.0, 0.9, 0.5), 8.0: box_at(0.0, 0.8, 0.5), 7.0: box_at(40.0, 0.7)}
+    asked = []
+
+    def registered(_, __, some):
+        asked.append([one.response for one in some])
+        return [there[one.response] for one in some]
+
+    monkeypatch.setattr(detection_module, "_registered", registered)
+    monkeypatch.setattr(detection_module, "_refined", lambda _, __, some: some)
+    monkeypatch.setattr(
+        detection_module,
+        "_scored",
+        lambda _, __, some: [replace(one, score=one.response / 10) for one in some],
+    )
+    proposals = Proposals(boxes, torch.tensor([9.0, 8, 7, 6]), torch.zeros(4, dtype=torch.long))
+    found = detection_module._register_candidates(None, {}, {0: proposals}, 2)
+    assert asked == [[9.0, 8.0], [7.0]]
+    assert [one.score for one in found[0]] == [0.7, 0.9]
 
 
 def test_photographs_are_searched_together_as_alone(registrar, found, monkeypatch):

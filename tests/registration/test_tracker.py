@@ -13,9 +13,10 @@ import trimesh
 from curvireg_torch import camera_matrix
 from curvireg_torch.errors import ImageError, LostObjectError
 from curvireg_torch.fitting import regions
+from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.edges import CROP_SIZE
 from curvireg_torch.fitting.flow import Frame, Keyframe, track_points
-from curvireg_torch.fitting.least_squares import fit_points, pixels
+from curvireg_torch.fitting.least_squares import INLIER_SCALE, PointMatches, fit_points, pixels
 from curvireg_torch.fitting.regions import (
     HALF_RATE_COUNT,
     SECTORS,
@@ -32,7 +33,7 @@ from curvireg_torch.registration.tracking import FLOW_SCALES, Tracker
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
-from tests._support import CAMERA, double, eye, seeded, sequence
+from tests._support import CAMERA, double, eye, seeded, sequence, uniform
 from tests.fitting.cube import cube, pose
 
 K = camera_matrix(500.0, 500.0, 159.5, 119.5, dtype=torch.float64)
@@ -141,6 +142,26 @@ def test_each_measurement_alone_moves_the_outline_onto_a_plain_cube(monkeypatch,
     follow.start(drawn(START), K, START)
     assert shift_in_pixels(START, truth) > 3.0
     assert shift_in_pixels(follow.track(drawn(truth), K).state.T[0], truth) < 0.5
+
+
+def test_a_step_follows_edges_the_end_of_the_colours_and_corners(monkeypatch):
+    follow = make_tracker(cube())
+    follow.start(drawn(START), K, START)
+    found = follow.measure(drawn(START), K, moved(START, [0.0, 0.0, 0.01], [0.01, 0.0, 0.0]))
+    given = []
+    monkeypatch.setattr(
+        ContourProblem, "selected_step", lambda *x: given.extend(x) or torch.zeros(1, 6)
+    )
+    model = uniform(1, 9, 3) - 0.5
+    uv = pixels(model, START[None], found.frame.K, follow.centre)
+    corners = PointMatches(model, uv, torch.ones(1, 9).double())
+    follow._step(found.frame, found.state, corners, 4.0)
+    _, points, _, J, _, (equations,) = given
+    colours = follow._colours(found.frame, found.state, J[:, points.outline[0]], 4)
+    matches = corners.measurements(found.state.T, found.frame.K, follow.centre, INLIER_SCALE)
+    for together, *parts in zip(equations, colours.equations(), matches.equations(), strict=True):
+        assert torch.allclose(together, sum(parts))
+        assert all((part != 0).any() for part in parts)
 
 
 def test_directions_lead_from_the_centre_of_the_object():

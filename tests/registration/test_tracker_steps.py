@@ -1,16 +1,20 @@
 """The tracker's steps in closed cases: predictions, keyframes, features, what is learned."""
 
 import math
+from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 import torch
 
+from curvireg_torch.fitting.contour_problem import ContourState
+from curvireg_torch.fitting.least_squares import PointMatches
 from curvireg_torch.fitting.regions import RegionModel
 from curvireg_torch.geometry.framing import boxes_at
 from curvireg_torch.registration import tracking
 from curvireg_torch.registration.tracking import Tracker
-from tests._support import double
+from tests._support import double, eye
 from tests.fitting.cube import pose
 
 K = double([[200.0, 0, 99.5], [0, 200.0, 49.5], [0, 0, 1]])
@@ -40,6 +44,81 @@ def test_boxes_of_meshes_outside_the_image_mean_nothing():
         assert float(boxes[0, 0]) < float(boxes[0, 2])
     for z, visible in ((0.6, True), (0.4, False), (-5.0, False)):
         assert boxes_at(HULL, at(z=z), K[None], SIZE)[1].tolist() == [visible], z
+
+
+def fitted(monkeypatch, keyframes, last, shift=100.0, *, stale=False):
+    """Of each step of a fit: the weights of its matches, its crop's focal length, its radius in px.
+
+    Of the ``keyframes`` the second is the nearest. The flow of number k in n levels has the weight
+    10 k + n. It finds a point at (1, 1) px of the first crop, where it moves the object by
+    ``shift`` px; that is (2, 2) px of the second crop. Steps leave a pose that is not quite rigid,
+    and contours that are always, or never, ``stale``."""
+    used = []
+    problem = SimpleNamespace(
+        state=lambda T: ContourState(T, T, None),
+        with_current_contours=lambda state: replace(state, points="new") if stale else state,
+    )
+    crops = [
+        SimpleNamespace(K=double([zoom, zoom, 1.0]).diag()[None], problem=problem)
+        for zoom in (1.0, 2.0)
+    ]
+
+    def track(keyframe, frame, *_, levels):
+        uv = frame.K[:, :2, :2].sum(dim=1)[None]
+        return PointMatches(torch.zeros(1, 1, 3), uv, double([[10.0 * keyframe + levels]]))
+
+    def step(frame, state, corners, radius):
+        assert (corners.uv == frame.K[0, 0, 0]).all(), "in the crop of the step"
+        used.append((corners.weight[0].tolist(), float(frame.K[0, 0, 0]), radius))
+        return state.T * double([1.01, 1.01, 1.01, 1.0])
+
+    def tracked(_, state, flows):
+        torch.testing.assert_close(state.T[:, :3, :3], eye(3)[None])
+        assert state.points == ("new" if stale else None)
+        assert len(flows) == len(used[-1][0])
+
+    monkeypatch.setattr(tracking, "track_points", track)
+    monkeypatch.setattr(tracking, "fit_points", lambda *_: at(x=5.0 * shift))
+    angles = torch.tensor([9.0, 2.0, 5.0])
+    follow = SimpleNamespace(
+        _last=last,
+        _keyframes=keyframes,
+        _frame=lambda *_: crops.pop(0),
+        _angles=lambda _: angles[: len(keyframes)],
+        _step=step,
+        _tracked=tracked,
+        centre=torch.zeros(3).double(),
+        hull=HULL * torch.tensor([1.0, 1.0, 0.0]),
+    )
+    image = None
+    Tracker._fit(follow, image, K, at())
+    return used
+
+
+def test_a_fit_uses_the_flow_from_the_last_frame_and_from_the_nearest_keyframe(monkeypatch):
+    weights, _, _ = fitted(monkeypatch, [1, 2, 3], 4)[0]
+    last = tracking.POINT_WEIGHT * (40 + tracking.PYRAMID_LAST)
+    keyframe = tracking.KEYFRAME_WEIGHT * (20 + tracking.PYRAMID_KEYFRAME)
+    assert weights == pytest.approx([last, keyframe])
+    weights, _, _ = fitted(monkeypatch, [1, 2, 3], 2)[0]
+    assert weights == pytest.approx([tracking.POINT_WEIGHT * (20 + tracking.PYRAMID_LAST)])
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(("part", "crop"), [(0.99, 1.0), (1.01, 2.0)])
+def test_the_crop_of_the_predicted_pose_serves_where_the_flow_moves_it_little(
+    monkeypatch, sign, part, crop
+):
+    steps = fitted(monkeypatch, [1, 2], 3, sign * part * tracking.WINDOW_SHIFT)
+    assert {zoom for _, zoom, _ in steps} == {crop}
+
+
+@pytest.mark.parametrize("stale", [False, True])
+def test_a_round_is_left_out_after_one_that_hardly_moved_the_contours(monkeypatch, stale):
+    first, *between, last = tracking.SEARCH_RADII
+    radii = [first, *between, last] if stale else [first, last]
+    steps = fitted(monkeypatch, [1, 2], 3, stale=stale)
+    assert [r for _, _, r in steps] == [r for r in radii for _ in range(tracking.STEPS_PER_ROUND)]
 
 
 def flow(ratio):
@@ -127,12 +206,14 @@ def test_a_turn_goes_on_about_the_axes_of_the_camera():
 
 
 def remembered(monkeypatch, angle, count):
-    """Places of the keyframes after ``count`` frames, the nearest of which is an angle away."""
+    """Places of the keyframes after ``count`` frames that each turn by an angle in degrees."""
     monkeypatch.setattr(tracking, "surface_corners", lambda *_, **__: (None, None))
-    follow = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([90.0, angle]))
+    follow = SimpleNamespace(_keyframes=[])
+    follow._angles = partial(Tracker._angles, follow)
     frame = SimpleNamespace(grey=None, K=K)
     for x in range(count):
-        Tracker._remember(follow, frame, at(float(x)), None)
+        turned = pose([0.0, math.radians(20.0 + x * angle), 0.0], [float(x), 0.0, 5.0])
+        Tracker._remember(follow, frame, turned[None], None)
     assert follow._last is not None
     return [float(keyframe.T[0, 0, 3]) for keyframe in follow._keyframes]
 
@@ -144,7 +225,7 @@ def test_frames_from_other_directions_are_kept(monkeypatch, angle, kept):
 
 def test_so_many_keyframes_are_kept(monkeypatch):
     latest = [float(x) for x in range(40 - tracking.MAX_KEYFRAMES, 40)]
-    assert remembered(monkeypatch, 90.0, 40) == latest
+    assert remembered(monkeypatch, 9.0, 40) == latest
 
 
 def test_lines_along_which_colours_say_nothing_do_not_count():
