@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..matching import ViewDescriber
 from ..registration import Registrar
 from ..visualization.contours import Drawn, draw_close_up
 from ..visualization.encoding import embedded, jpeg, to_uint8
@@ -148,14 +147,14 @@ def _pairs(report: Inspection, registrar: Registrar | None) -> str:
         return lines[0]
     shown = report.pairs[: MOST_PAIRS if report.alike else FEW_PAIRS]
     for pair in shown:
-        lines.append(_pair_figure(registrar.describer, registrar, pair))
+        lines.append(_pair_figure(registrar, pair))
     return "\n".join(lines)
 
 
 @torch.no_grad()
-def _pair_figure(describer: ViewDescriber, registrar: Registrar, pair: LookAlike) -> str:
+def _pair_figure(registrar: Registrar, pair: LookAlike) -> str:
     distance = registrar.bank.distances.median().cpu().expand(2)
-    pictures = describer.shaded(torch.stack([pair.rotation, pair.rival]), distance)
+    pictures = registrar.describer.shaded(torch.stack([pair.rotation, pair.rival]), distance)
     images = "".join(_image(_picture(picture)) for picture in pictures)
     verdict = "alike" if pair.is_alike else "different"
     told = f"its print and {pair.hint}" if pair.print_tells else pair.hint

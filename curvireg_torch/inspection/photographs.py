@@ -1,6 +1,7 @@
 """Generated photographs of a mesh: its pose, size and place, light, background, clutter, focus and
 a box that is not exact."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,14 +16,15 @@ from torch import Tensor
 from ..filters import gaussian_smooth
 from ..geometry import camera_matrix
 from ..geometry.cameras import point_in_cameras, pose_around, transform
+from ..geometry.framing import clipped
 from ..geometry.viewpoint import up_rotation
 from ..matching.describe import view_mesh
 from ..mesh import Mesh, SurfaceColours, as_mesh, mesh_centre, mesh_radius
-from ..mesh.colours import colours_at
 from ..mesh.edges import simplified
 from ..synthetic import procedural_background, random_pose, synthesize_photograph
 from ..utils.likes import MeshLike
 from .facts import MANY_FACES
+from .surface import coloured_points
 
 SIZE = (480, 640)  # of the photographs, H, W
 FOCAL = 700.0  # px: a field of view of 49 degrees
@@ -136,10 +138,7 @@ def photographed_mesh(mesh: Mesh) -> Mesh:
     centre = mesh_centre(mesh).numpy()
     vertices, faces = simplified(mesh, centre, COLOURED_FACES)
     vertices += centre
-    points, owners = trimesh.sample.sample_surface(mesh.surface, COLOURED_POINTS, seed=0)
-    corners = mesh.surface.triangles[owners]
-    weights = trimesh.triangles.points_to_barycentric(corners, points)
-    seen = colours_at(mesh.colours, owners, *weights[:, 1:].T)
+    points, seen = coloured_points(mesh, mesh.colours, COLOURED_POINTS)
     nearest = cKDTree(points).query(vertices)[1]
     pixels = (255.0 * seen[nearest]).round().astype(np.uint8)
     colours = replace(SurfaceColours.plain(len(faces)), corners=pixels[faces])
@@ -198,10 +197,7 @@ def _random_rotation(generator: torch.Generator) -> Tensor:
 def _wrong_box(box: Tensor, generator: torch.Generator) -> Tensor:
     """The box with edges moved at random, within the photograph."""
     sides = (box[2:] - box[:2]).repeat(2)
-    moved = box + BOX_ERROR * sides * torch.randn(4, generator=generator)
-    height, width = SIZE
-    high = torch.tensor([width - 0.5, height - 0.5, width - 0.5, height - 0.5])
-    return torch.minimum(moved.clamp(min=-0.5), high)
+    return clipped(box + BOX_ERROR * sides * torch.randn(4, generator=generator), SIZE)
 
 
 def _random_object(radius: float, generator: torch.Generator) -> trimesh.Trimesh:
@@ -231,11 +227,11 @@ def _with_objects_behind(
     count = 1 + int(MOST_BESIDE * float(torch.rand((), generator=generator)))
     picture = background
     for _ in range(count):
-        angle, far, size, deep = torch.rand(4, generator=generator, dtype=torch.float64)
-        away = radius * (NEAREST + (FARTHEST - NEAREST) * far)
-        aside = torch.stack([(2.0 * torch.pi * angle).cos(), (2.0 * torch.pi * angle).sin()])
-        place = centre + torch.cat([away * aside, (2.0 * radius * deep)[None]])
-        other = _random_object(radius * float(SIZES[0] + (SIZES[1] - SIZES[0]) * size), generator)
+        angle, far, size, deep = torch.rand(4, generator=generator, dtype=torch.float64).tolist()
+        away = radius * float(np.interp(far, (0, 1), (NEAREST, FARTHEST)))
+        aside = [away * math.cos(2 * math.pi * angle), away * math.sin(2 * math.pi * angle)]
+        place = centre + torch.tensor([*aside, 2.0 * radius * deep], dtype=torch.float64)
+        other = _random_object(radius * float(np.interp(size, (0, 1), SIZES)), generator)
         picture = _with_object(picture, other, place, generator)
     return picture
 

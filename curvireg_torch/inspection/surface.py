@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..geometry import rotation_error
-from ..mesh import Mesh, as_mesh, mesh_symmetries
+from ..mesh import Mesh, SurfaceColours, as_mesh, mesh_symmetries
 from ..mesh.colours import VARIED_BY, VARIED_FRACTION, colours_at
 from ..mesh.mesh import mesh_radius
 from ..rendering.embree import RayScene
@@ -87,19 +87,26 @@ def look_symmetries(mesh: MeshLike) -> Tensor:
     return torch.stack([torch.eye(4, dtype=torch.float64), *same])
 
 
+def coloured_points(mesh: Mesh, colours: SurfaceColours, count: int) -> tuple[Floats, Floats]:
+    """(N, 3) points of a mesh's surface, and their colours in [0, 1]."""
+    points, faces = trimesh.sample.sample_surface(mesh.surface, count, seed=0)
+    weights = trimesh.triangles.points_to_barycentric(mesh.surface.triangles[faces], points)
+    return np.asarray(points), colours_at(colours, faces, *weights[:, 1:].T).astype(float)
+
+
 class _ColouredPoints:
     """Points of a mesh's surface, and their colours if these vary."""
 
     def __init__(self, mesh: Mesh) -> None:
-        self.points, faces = trimesh.sample.sample_surface(mesh.surface, DENSER * POINTS, seed=0)
+        self.colours = None
+        if mesh.colours is not None and mesh.has_colours:
+            self.points, self.colours = coloured_points(mesh, mesh.colours, DENSER * POINTS)
+        else:
+            sampled = trimesh.sample.sample_surface(mesh.surface, DENSER * POINTS, seed=0)
+            self.points = np.asarray(sampled[0])
         self.tree = cKDTree(self.points)
         self.diameter = 2.0 * mesh_radius(mesh)
         self.some = self.points[::DENSER]
-        self.colours = None
-        if mesh.colours is not None and mesh.has_colours:
-            corners = mesh.surface.triangles[faces]
-            weights = trimesh.triangles.points_to_barycentric(corners, self.points)
-            self.colours = colours_at(mesh.colours, faces, *weights[:, 1:].T)
         # of points on one and the same surface
         distance, nearest = self.tree.query(self.some, k=2)
         self.spacing = float(distance[:, 1].mean())

@@ -6,7 +6,6 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, TypeAlias
 
 import torch
@@ -46,8 +45,12 @@ IDENTITY = torch.eye(3, dtype=torch.float64)[None]
 Report: TypeAlias = Callable[[str, int, int], object]
 """Is called with a stage, done and total."""
 
-Register: TypeAlias = Callable[[Sequence[Any]], list["Outcome"]]
-"""The outcomes of a batch: of photographs, or of their numbers."""
+Register: TypeAlias = Callable[[Sequence[GeneratedPhotograph]], list["Outcome"]]
+"""The outcomes of photographs."""
+
+Conditions: TypeAlias = dict[str, tuple[Register | None, Register]]
+"""Other conditions by name: how photographs are registered without and under them; None: as they
+were."""
 
 
 def report_nothing(stage: str, done: int, total: int) -> None:
@@ -140,7 +143,7 @@ class Trial:
 
 def run_trial(
     registrar: Registrar,
-    generate: Callable[[int], GeneratedPhotograph],
+    generate: PhotographGenerator,
     count: int,
     *,
     with_camera: bool = True,
@@ -153,31 +156,27 @@ def run_trial(
 
     Args:
         registrar: of the mesh.
-        generate: photograph by number; other conditions need a :class:`PhotographGenerator`.
+        generate: photographs of the mesh, by number.
         count: of the photographs.
         with_camera: whether the camera is known.
         compare: whether other conditions are tried.
         report: called with "photographs", done and in all, by one thread at a time, after "bank" of
             the mesh with or without a print.
     """
-    part = max(1, round(COMPARED_FRACTION * count))
     setup = _Setup(registrar, with_camera, _symmetries(registrar))
-    conditions = (
-        _conditions(setup, generate, report)
-        if compare and isinstance(generate, PhotographGenerator)
-        else []
-    )
-    registrations = sum(1 if condition.before is None else 2 for condition in conditions)
-    total = count + part * registrations
-    counter = itertools.count(1)
+    conditions = _conditions(setup, generate, report) if compare else {}
+    part = max(1, round(COMPARED_FRACTION * count))
+    total = count + part * sum(1 if before is None else 2 for before, _ in conditions.values())
+    done = 0
     lock = threading.Lock()
 
-    def results(register: Register, items: Sequence[Any]) -> list[Outcome]:
+    def results(register: Callable[[Sequence[Any]], list[Outcome]], items: Any) -> list[Outcome]:
         def job(batch: Sequence[Any]) -> list[Outcome]:
+            nonlocal done
             outcomes = register(batch)
             with lock:
-                for _ in batch:
-                    report("photographs", next(counter), total)
+                done += len(batch)
+                report("photographs", done, total)
             return outcomes
 
         size = share_of_worker(len(items), available_threads())
@@ -191,21 +190,10 @@ def run_trial(
     some = outcomes[:part]
     photographs = [outcome.photograph for outcome in some]
     compared = {}
-    for condition in conditions:
-        before = some if condition.before is None else results(condition.before, photographs)
-        after = results(condition.after, photographs)
-        compared[condition.name] = Expected.of(before), Expected.of(after)
+    for name, (before, after) in conditions.items():
+        without = some if before is None else results(before, photographs)
+        compared[name] = Expected.of(without), Expected.of(results(after, photographs))
     return Trial(tuple(outcomes), compared)
-
-
-@dataclass(frozen=True)
-class _Condition:
-    """Another condition, and how photographs are registered under it, and without it where that is
-    not how they were registered."""
-
-    name: str
-    after: Register
-    before: Register | None = None
 
 
 @dataclass(frozen=True)
@@ -236,18 +224,8 @@ class _Setup:
             for photograph, result in zip(photographs, found, strict=True)
         ]
 
-    def register_with_hints(self, photographs: Sequence[GeneratedPhotograph]) -> list[Outcome]:
-        """The outcomes with poses that a user has set by hand, some degrees off."""
-        return self.register(photographs, prior=list(map(_hint, photographs)))
-
-    def register_with_second(
-        self, photographs: Sequence[GeneratedPhotograph], subject: Mesh
-    ) -> list[Outcome]:
-        """The outcomes of photographs, each with a second one of the ``subject``, from beside
-        it."""
-        return [self._with_second(photograph, subject) for photograph in photographs]
-
-    def _with_second(self, photograph: GeneratedPhotograph, subject: Mesh) -> Outcome:
+    def with_second(self, photograph: GeneratedPhotograph, subject: Mesh) -> Outcome:
+        """The outcome of a photograph and a second one of the ``subject``, from beside it."""
         K = photograph.camera
         turn = rotation_from_axis_angle(
             torch.tensor([0.0, math.radians(SECOND_CAMERA), 0.0], dtype=torch.float64)
@@ -281,39 +259,43 @@ class _Setup:
         return Outcome(photograph, result, error, elevation)
 
 
-def _conditions(setup: _Setup, generate: PhotographGenerator, report: Report) -> list[_Condition]:
+def _conditions(setup: _Setup, generate: PhotographGenerator, report: Report) -> Conditions:
     """What a camera, a hint, a second photograph and a print add, or what is lost without them.
 
     A print makes poses differ that look alike without: with and without it, each counts.
     """
-    is_known = setup.with_camera
-    other = replace(setup, with_camera=not is_known)
-    conditions = [
-        _Condition("without a camera" if is_known else "with a camera", other.register),
-        _Condition(f"with a pose prior within {HINT_DEGREES:g} degrees", setup.register_with_hints),
-        _Condition(
-            "with a second photograph from another side",
-            partial(setup.register_with_second, subject=generate.subject),
+
+    def like(mesh: Mesh) -> Registrar:
+        bank = setup.registrar.bank
+        pipeline = setup.registrar.pipeline
+        other = cached_bank(mesh, pipeline=pipeline, device=bank.device, progress=report)
+        return Registrar(other, mesh_is="exact")
+
+    other = replace(setup, with_camera=not setup.with_camera)
+    conditions: Conditions = {
+        "without a camera" if setup.with_camera else "with a camera": (None, other.register),
+        f"with a pose prior within {HINT_DEGREES:g} degrees": (
+            None,
+            lambda some: setup.register(some, prior=list(map(_hint, some))),
         ),
-    ]
+        "with a second photograph from another side": (
+            None,
+            lambda some: [setup.with_second(each, generate.subject) for each in some],
+        ),
+    }
     if setup.mesh.has_colours:
-        plain = replace(
-            setup, registrar=_like(setup.registrar, replace(setup.mesh, colours=None), report)
-        )
-        return [*conditions, _Condition("without the mesh's colours", plain.register)]
+        plain = replace(setup, registrar=like(replace(setup.mesh, colours=None)))
+        return {**conditions, "without the mesh's colours": (None, plain.register)}
     printed = with_print(setup.mesh)
     by_shape = replace(setup, symmetries=IDENTITY)
-    by_print = replace(by_shape, registrar=_like(setup.registrar, printed, report))
+    by_print = replace(by_shape, registrar=like(printed))
     print_seen = replace(generate, mesh=printed)
+
+    def shown(setup: _Setup) -> Register:
+        return lambda some: setup.register([print_seen(each.number) for each in some])
+
     name = "with a print, also in the mesh: orientations that look alike without count as wrong"
-    return [
-        *conditions,
-        _Condition(
-            name,
-            lambda photographs: by_print.register([print_seen(one.number) for one in photographs]),
-            lambda photographs: by_shape.register([print_seen(one.number) for one in photographs]),
-        ),
-    ]
+    return {**conditions, name: (shown(by_shape), shown(by_print))}
 
 
 def _symmetries(registrar: Registrar) -> Tensor:
@@ -321,13 +303,6 @@ def _symmetries(registrar: Registrar) -> Tensor:
     given = registrar.symmetries
     transforms = look_symmetries(registrar.bank.mesh) if given is None else given
     return transforms[:, :3, :3].double()
-
-
-def _like(registrar: Registrar, mesh: Mesh, report: Report) -> Registrar:
-    """A registrar of another mesh with the same settings."""
-    bank = registrar.bank
-    other = cached_bank(mesh, pipeline=registrar.pipeline, device=bank.device, progress=report)
-    return Registrar(other, mesh_is="exact")
 
 
 def _viewpoint_of(mesh: Mesh, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -15,7 +15,7 @@ from ..mesh.mesh import Mesh, mesh_centre, mesh_radius
 from ..utils.rows import Rows
 from .embree import RasterRenderer
 from .renderer import DepthRenderer
-from .visibility import FaceTests, RayCaster, Visibility
+from .visibility import FaceTests, RayCaster
 
 MAX_OCCLUDING = 256  # Points per pose on occluding contours
 MAX_CREASES = 128  # Points per pose on creases
@@ -155,7 +155,9 @@ class _Level:
         return torch.as_tensor(values).to(self.device, dtype)
 
 
-def _visibility(vertices: np.ndarray, faces: np.ndarray, device: torch.device) -> Visibility:
+def _visibility(
+    vertices: np.ndarray, faces: np.ndarray, device: torch.device
+) -> RayCaster | FaceTests:
     if device.type == "cpu":
         return RayCaster(vertices, faces)
     return FaceTests(vertices, faces, device)

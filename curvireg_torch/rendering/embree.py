@@ -14,9 +14,9 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from torch import Tensor
 
-from ..mesh.mesh import Mesh, box_corners, extreme_points, mesh_centre, mesh_radius
+from ..mesh.mesh import Mesh, box_corners, extreme_points
 from ..utils.threads import for_each
-from .renderer import NEAREST, check_render_arguments
+from .renderer import NEAREST, MeshRenderer
 
 _MISS = 1e30  # embreex returns 1e37 where a ray hits nothing
 _MAX_HULL_VERTICES = 200_000  # above, a convex hull takes more time than it saves
@@ -67,21 +67,12 @@ def float32(x: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(x, np.float32)
 
 
-class EmbreeRenderer:
+class EmbreeRenderer(MeshRenderer):
     """Casts one ray through each pixel's centre inside the outline of the object's hull, views in
     parallel on threads. Thread-safe, because rays only read the scene, and fork-safe. Cannot be
     pickled."""
 
     name = "embree"
-
-    def __init__(self, mesh: Mesh | trimesh.Trimesh) -> None:
-        # Embree and OpenCV compute in float32, so the object is centred and scaled to radius 1.
-        self._mesh = mesh
-        self._centre = mesh_centre(mesh).numpy()
-        self._radius = mesh_radius(mesh)
-
-    def _scaled(self, points: Any) -> np.ndarray:
-        return np.asarray((np.asarray(points) - self._centre) / self._radius)
 
     @cached_property
     def _scene(self) -> tuple[RayScene, np.ndarray]:
@@ -90,22 +81,9 @@ class EmbreeRenderer:
         outline = extreme_points(self._mesh) if few else box_corners(self._mesh)
         return RayScene(self._scaled(self._mesh.vertices), self._mesh.faces), self._scaled(outline)
 
-    def render(
-        self,
-        T_cam_from_model: Tensor,
-        camera_matrix: Tensor,
-        size: tuple[int, int],
-        *,
-        orthographic: bool = False,
-    ) -> Tensor:
+    def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
         scene, _ = self._scene
-        return self._cast(
-            T_cam_from_model,
-            camera_matrix,
-            size,
-            orthographic,
-            lambda _, *rays: scene.distance(*rays),
-        )
+        return self._cast(T, K, size, orthographic, lambda _, *rays: scene.distance(*rays))
 
     def _cast(
         self,
@@ -117,17 +95,17 @@ class EmbreeRenderer:
     ) -> Tensor:
         """(N, 1, H, W) depth; ``hit`` is called with the place of the pixels of a view that may
         show the object, and their rays, and returns the distances to what these hit."""
-        poses, cameras = (x.numpy() for x in check_render_arguments(T, K, size))
-        depth = np.zeros((len(poses), *size), np.float32)
+        poses = T.numpy()
+        cameras = K.numpy()
+        depth = np.zeros((len(T), *size), np.float32)
 
         def cast(i: int) -> None:
             if rays := self._rays(poses[i], cameras[i], size, orthographic):
                 mask, starts, directions, near = rays
-                along = hit((i, mask), starts, directions)
-                z = (along + np.float32(near)) * np.float32(self._radius)
+                z = hit((i, mask), starts, directions) + np.float32(near)
                 depth[i, mask] = np.where(np.isinf(z), np.float32(0.0), z)
 
-        for_each(len(poses), cast)
+        for_each(len(T), cast)
         return torch.from_numpy(depth)[:, None]
 
     def faces_at(
@@ -141,7 +119,8 @@ class EmbreeRenderer:
         """(N, H, W) int32 faces that pixels show, -1 for none; (N, H, W) float32 u and v of their
         points (1 - u - v) a + u b + v c, with the face's corners a, b, c; and (N, 1, H, W)
         depth."""
-        face = np.full((len(T_cam_from_model), *size), -1, dtype=np.int32)
+        T, K = self._in_radii(T_cam_from_model, camera_matrix, size, orthographic)
+        face = np.full((len(T), *size), -1, dtype=np.int32)
         u, v = (np.zeros(face.shape, np.float32) for _ in range(2))
         scene, _ = self._scene
 
@@ -149,8 +128,7 @@ class EmbreeRenderer:
             face[place], u[place], v[place], along = scene.hits(*rays)
             return along
 
-        depth = self._cast(T_cam_from_model, camera_matrix, size, orthographic, hit)
-        return face, u, v, depth
+        return face, u, v, self._radius * self._cast(T, K, size, orthographic, hit)
 
     def _rays(
         self, T: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
@@ -158,8 +136,7 @@ class EmbreeRenderer:
         """Pixels (H, W) that may show the object, origins and directions of their rays, and their
         start depth."""
         R = T[:3, :3]
-        # centre of the object in the camera, in radii
-        t = (T[:3, 3] + R @ self._centre) / self._radius
+        t = T[:3, 3]  # centre of the object in the camera
         outline = self._scene[1] @ R.T + t
         nearest = outline[:, 2].min()
         if outline[:, 2].max() <= NEAREST:
@@ -168,7 +145,7 @@ class EmbreeRenderer:
         # Rays start at the plane z = near close to the object, which keeps float32 precise for
         # distant objects. Rows and columns are computed in float64, pixels in float32.
         near = max(nearest - 1e-3, NEAREST)
-        reach = 1.0 / self._radius if orthographic else near
+        reach = 1.0 if orthographic else near
         y = (np.arange(size[0]) - K[1, 2]) / K[1, 1]
         x = (np.arange(size[1]) - K[0, 2]) / K[0, 0]
         pixels = np.nonzero(mask)
@@ -186,7 +163,7 @@ class EmbreeRenderer:
         """(H, W) bool: pixels inside the outline's projection, dilated by one pixel."""
         full = np.ones(size, dtype=bool)
         if orthographic:
-            xy = outline[:, :2] * self._radius
+            xy = outline[:, :2]
         elif outline[:, 2].min() > NEAREST:
             xy = outline[:, :2] / outline[:, 2:]
         else:
@@ -229,20 +206,12 @@ class RasterRenderer(EmbreeRenderer):
         self._settings = cv2.TriangleRasterizeSettings()
         self._settings.setCullingMode(cv2.RASTERIZE_CULLING_NONE)
 
-    def render(
-        self,
-        T_cam_from_model: Tensor,
-        camera_matrix: Tensor,
-        size: tuple[int, int],
-        *,
-        orthographic: bool = False,
-    ) -> Tensor:
+    def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
         if orthographic or len(self._faces) > size[0] * size[1]:
-            return super().render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
-        T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
-        # of the object's centre, in radii
-        position = (T[:, :3, 3] + T[:, :3, :3] @ self._centre) / self._radius
-        z = position[:, 2:] + T[:, 2, :3] @ self._corners.T
+            return super()._depth(T, K, size, orthographic)
+        poses = T.numpy()
+        cameras = K.numpy()
+        z = poses[:, 2, 3:] + poses[:, 2, :3] @ self._corners.T
         near = z.min(axis=1) - BESIDE
         far = z.max(axis=1) + BESIDE
         depth = np.zeros((len(T), 1, *size), np.float32)
@@ -250,25 +219,16 @@ class RasterRenderer(EmbreeRenderer):
 
         def draw(i: int) -> None:
             if drawn[i]:
-                depth[i, 0] = self._draw(
-                    T[i, :3, :3], position[i], K[i], size, float(near[i]), float(far[i])
-                )
+                depth[i, 0] = self._draw(poses[i], cameras[i], size, float(near[i]), float(far[i]))
 
         for_each(len(T), draw)
-        if len(rest := np.nonzero(~drawn & (far > NEAREST))[0]):
-            depth[rest] = (
-                super().render(torch.from_numpy(T[rest]), torch.from_numpy(K[rest]), size).numpy()
-            )
+        rest = torch.from_numpy(~drawn & (far > NEAREST))
+        if rest.any():
+            depth[rest.numpy()] = super()._depth(T[rest], K[rest], size, orthographic).numpy()
         return torch.from_numpy(depth)
 
     def _draw(
-        self,
-        R: np.ndarray,
-        t: np.ndarray,
-        K: np.ndarray,
-        size: tuple[int, int],
-        near: float,
-        far: float,
+        self, T: np.ndarray, K: np.ndarray, size: tuple[int, int], near: float, far: float
     ) -> np.ndarray:
         """(H, W) depth of one view."""
         H, W = size
@@ -277,12 +237,10 @@ class RasterRenderer(EmbreeRenderer):
         x = [2.0 * K[0, 0], 0.0, 2.0 * K[0, 2] - (W - 1)]
         y = [0.0, -2.0 * K[1, 1], -(2.0 * K[1, 2] - (H - 1))]
         shear = np.array([x, y, [0.0, 0.0, -H]]) / H
-        camera = (shear @ np.column_stack([R, t])).astype(np.float32)
+        camera = (shear @ T[:3]).astype(np.float32)
         z = np.full(size, far, np.float32)
         cv2.triangleRasterizeDepth(
             self._vertices, self._faces, z, camera, math.pi / 2.0, near, far, self._settings
         )
-        is_object = z <= far - 0.5 * BESIDE
-        z *= np.float32(self._radius)
-        z *= is_object
+        z *= z <= far - 0.5 * BESIDE
         return z

@@ -13,10 +13,9 @@ import trimesh
 from torch import Tensor
 
 from ..errors import InvalidInputError, RenderingError
-from ..geometry.cameras import point_in_cameras
 from ..geometry.conversions import opencv_from_opengl
-from ..mesh.mesh import Mesh, box_corners, mesh_centre, mesh_radius
-from .renderer import NEAREST, check_render_arguments
+from ..mesh.mesh import Mesh, box_corners
+from .renderer import NEAREST, MeshRenderer
 
 _lock = threading.Lock()
 # The process that created the only OffscreenRenderer, and that: under EGL a second one fails, none
@@ -65,7 +64,7 @@ def _release() -> None:
     _context = None
 
 
-class PyrenderRenderer:
+class PyrenderRenderer(MeshRenderer):
     """Draws perspective views into the process's only EGL context, one at a time; a lock makes it
     thread-safe. It works around a defect of pyrender 0.1.45: the framebuffer takes four samples per
     pixel and resolves depth to one that is off the centre; segmentation mode avoids that, but
@@ -75,16 +74,13 @@ class PyrenderRenderer:
     name = "pyrender"
 
     def __init__(self, mesh: Mesh | trimesh.Trimesh) -> None:
-        self._centre = mesh_centre(mesh)
-        self._radius = mesh_radius(mesh)
-        self._corners = (box_corners(mesh) - self._centre) / self._radius
+        super().__init__(mesh)
+        self._corners = torch.from_numpy(self._scaled(box_corners(mesh)))
         with _lock:
             _offscreen()
             import pyrender
 
-            positions = ((np.asarray(mesh.vertices) - self._centre.numpy()) / self._radius).astype(
-                np.float32
-            )
+            positions = self._scaled(mesh.vertices).astype(np.float32)
             faces = np.asarray(mesh.faces, np.uint32)
             both_sides = np.concatenate([faces, faces[:, ::-1]])
             primitive = pyrender.Primitive(positions=positions, indices=both_sides, mode=4)
@@ -92,24 +88,16 @@ class PyrenderRenderer:
             self._node = self._scene.add(pyrender.Mesh([primitive]))
             self._flags = pyrender.RenderFlags.DEPTH_ONLY | pyrender.RenderFlags.SEG
 
-    def render(
-        self,
-        T_cam_from_model: Tensor,
-        camera_matrix: Tensor,
-        size: tuple[int, int],
-        *,
-        orthographic: bool = False,
-    ) -> Tensor:
+    def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
         if orthographic:
             raise InvalidInputError("renderer: 'pyrender' knows no parallel projection; use 'auto'")
-        T, K = check_render_arguments(T_cam_from_model, camera_matrix, size)
         out = np.zeros((len(T), 1, *size), dtype=np.float32)
         with _lock:
             offscreen = _offscreen()
             offscreen.viewport_height, offscreen.viewport_width = size
             try:
                 for i in range(len(T)):
-                    out[i, 0] = self._draw(offscreen, T[i], K[i]) * self._radius
+                    out[i, 0] = self._draw(offscreen, T[i], K[i])
             finally:
                 _offscreen()  # unbind it from this thread
         return torch.from_numpy(out)
@@ -118,10 +106,8 @@ class PyrenderRenderer:
         """(H, W) depth in radii."""
         import pyrender
 
-        cam_from_model = T.clone()  # in radii, with the origin at the object's centre
-        cam_from_model[:3, 3] = point_in_cameras(T, self._centre) / self._radius
         # A tight clip range spends all 24 bits of depth on the object.
-        z = self._corners @ cam_from_model[2, :3] + cam_from_model[2, 3]
+        z = self._corners @ T[2, :3] + T[2, 3]
         near = max(float(z.min()) - 1e-3, NEAREST)
         far = float(z.max()) + 1e-3
         if far - 1e-3 <= near:
@@ -129,7 +115,7 @@ class PyrenderRenderer:
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
         # pixel (0, 0) of OpenGL begins at 0
         camera = pyrender.IntrinsicsCamera(fx, fy, cx + 0.5, cy + 0.5, znear=near, zfar=far)
-        pose = torch.linalg.inv(opencv_from_opengl(cam_from_model)).numpy()
+        pose = torch.linalg.inv(opencv_from_opengl(T)).numpy()
         node = self._scene.add(camera, pose=pose)
         try:
             return offscreen.render(

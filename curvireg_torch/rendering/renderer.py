@@ -1,11 +1,15 @@
-"""What a renderer is, and what all of them check."""
+"""What a renderer is, and what all of them check and measure in."""
 
-from typing import Protocol
+from typing import Any, Protocol
 
+import numpy as np
 import torch
+import trimesh
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..geometry.cameras import point_in_cameras, transform
+from ..mesh.mesh import Mesh, mesh_centre, mesh_radius
 from ..utils.checks import check_camera_matrix, check_pose, check_tensor
 
 # Near plane, in object radii: surface closer to the camera plane, or behind it, is not rendered
@@ -34,6 +38,48 @@ class DepthRenderer(Protocol):
         """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32
         z-depth."""
         ...
+
+
+class MeshRenderer:
+    """A :class:`DepthRenderer` of a mesh that is centred and scaled to radius 1: the libraries that
+    draw compute in single precision. Its subclasses draw in these units."""
+
+    name: str
+
+    def __init__(self, mesh: Mesh | trimesh.Trimesh) -> None:
+        self._mesh = mesh
+        self._centre = mesh_centre(mesh)
+        self._radius = mesh_radius(mesh)
+
+    def _scaled(self, points: Any) -> np.ndarray:
+        return np.asarray((np.asarray(points) - self._centre.numpy()) / self._radius)
+
+    def render(
+        self,
+        T_cam_from_model: Tensor,
+        camera_matrix: Tensor,
+        size: tuple[int, int],
+        *,
+        orthographic: bool = False,
+    ) -> Tensor:
+        """See :meth:`DepthRenderer.render`."""
+        T, K = self._in_radii(T_cam_from_model, camera_matrix, size, orthographic)
+        return self._radius * self._depth(T, K, size, orthographic)
+
+    def _in_radii(
+        self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Poses and cameras of the scaled mesh, checked, as float64 on the CPU."""
+        T, K = check_render_arguments(T, K, size)
+        if orthographic:
+            K = K.clone()
+            K[:, :2, :2] *= self._radius
+        place = point_in_cameras(T, self._centre) / self._radius
+        return transform(T[:, :3, :3], place), K
+
+    def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
+        """(N, 1, H, W) depth of the scaled mesh."""
+        raise NotImplementedError
 
 
 def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

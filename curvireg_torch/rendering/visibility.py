@@ -2,7 +2,7 @@
 all its faces on other devices."""
 
 from collections.abc import Callable
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -20,22 +20,15 @@ DepthOf: TypeAlias = Callable[[Tensor, Tensor | None], Tensor]
 mesh first; inf beside it, and for rays that are not ``wanted`` (N, M), None: all."""
 
 
-class Visibility(Protocol):
-    """The surface of a mesh with vertices (V, 3) and faces (F, 3)."""
-
-    def seen_from(self, R: Tensor, position: Tensor) -> DepthOf:
-        """The depth in cameras in which the mesh has rotations (N, 3, 3) and its origin positions
-        (N, 3), float64."""
-        ...
-
-
 class RayCaster:
-    """:class:`Visibility` on a CPU."""
+    """The surface of a mesh with vertices (V, 3) and faces (F, 3), on a CPU."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self._scene = RayScene(vertices, faces)
 
     def seen_from(self, R: Tensor, position: Tensor) -> DepthOf:
+        """The depth in cameras in which the mesh has rotations (N, 3, 3) and its origin positions
+        (N, 3), float64."""
         eye = -(position[:, None] @ R).float()
         across = R[:, :2].float()
         forward = R[:, 2:].float()
@@ -59,7 +52,7 @@ class RayCaster:
 
 
 class FaceTests:
-    """:class:`Visibility` on one device, which tests each ray against all faces, as a GPU does
+    """Like :class:`RayCaster` on one device: tests each ray against all faces, as a GPU does
     fast."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, device: torch.device) -> None:

@@ -4,10 +4,9 @@ import torch
 import trimesh
 from torch import Tensor
 
-from ..geometry.cameras import point_in_cameras
 from ..mesh.mesh import Mesh
 from .embree import EmbreeRenderer
-from .renderer import NEAREST, check_render_arguments
+from .renderer import NEAREST
 
 FRAGMENTS_AT_A_TIME = 2**24
 """Pixels of the boxes around triangles that are tested together, about 100 bytes each."""
@@ -34,28 +33,16 @@ class DeviceRenderer(EmbreeRenderer):
         self._vertices = torch.from_numpy(self._scaled(mesh.vertices)).to(self._device)
         self._faces = torch.tensor(mesh.faces, dtype=torch.long).to(self._device)
 
-    def render(
-        self,
-        T_cam_from_model: Tensor,
-        camera_matrix: Tensor,
-        size: tuple[int, int],
-        *,
-        orthographic: bool = False,
-    ) -> Tensor:
-        """See :class:`.DepthRenderer`; the depth is on this device."""
+    def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
         if orthographic:
-            rays = super().render(T_cam_from_model, camera_matrix, size, orthographic=True)
-            return rays.to(self._device)
-        T, K = check_render_arguments(T_cam_from_model, camera_matrix, size)
-        position = point_in_cameras(T, torch.from_numpy(self._centre)) / self._radius
-        R = T[:, :3, :3].to(self._device)
-        points = self._vertices @ R.mT + position[:, None].to(self._device)
+            return super()._depth(T, K, size, orthographic).to(self._device)
+        poses = T.to(self._device)
+        points = self._vertices @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
         z = points[..., 2]
-        pixels = _projected(points, K.to(self._device))
-        depth = self._radius * _drawn(pixels, z, self._faces, size)
+        depth = _drawn(_projected(points, K.to(self._device)), z, self._faces, size)
         is_cut = ((z.amin(dim=1) <= NEAREST) & (z.amax(dim=1) > NEAREST)).cpu()
         if is_cut.any():
-            rays = super().render(T[is_cut], K[is_cut], size)
+            rays = super()._depth(T[is_cut], K[is_cut], size, orthographic)
             depth[is_cut.to(self._device)] = rays.to(self._device)
         return depth
 

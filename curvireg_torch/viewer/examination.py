@@ -1,8 +1,6 @@
 """Which sides of the mesh on the page look alike: found in a thread, while nothing else is done."""
 
 import asyncio
-import math
-import time
 import traceback
 from functools import partial
 
@@ -12,9 +10,6 @@ from ..inspection.report import Inspection, look_alikes_of
 from ..jobs.options import RegisterOptions
 from ..mesh import Mesh
 from .session import Session, registrar_key
-
-MAX_SECONDS = 60.0  # after which an examination is given up
-TOO_LONG = "not examined: that takes longer than a minute"
 
 
 class Examination:
@@ -33,7 +28,6 @@ class Examination:
         self.waits = False
         self._subject: tuple[Mesh, RegisterOptions] | None = None
         self._task: asyncio.Task[None] | None = None
-        self._deadline = 0.0
 
     @property
     def running(self) -> bool:
@@ -43,45 +37,36 @@ class Examination:
     def start_if_due(self, *, searching: bool) -> None:
         """Examine the mesh if it is new, unless there is a search."""
         self.waits = searching
-        if not self._is_current():
-            self.advice = ""
-        mesh = self.session.mesh
-        if self.running or searching or mesh is None or self._is_current():
+        if self._is_current():
             return
-        self._begin(mesh, MAX_SECONDS)
+        self.advice = ""
+        subject = self._wanted()
+        if subject is not None and not self.running and not searching:
+            self._subject = subject
+            self._task = asyncio.create_task(self._run(*subject))
 
-    def start_patiently(self) -> None:
-        """Examine the mesh again, without a limit."""
-        if not self.running and self.session.mesh is not None:
-            self.advice = ""
-            self._begin(self.session.mesh, math.inf)
-
-    def _begin(self, mesh: Mesh, seconds: float) -> None:
-        self._subject = mesh, registrar_key(self.session.request())
-        self._deadline = time.monotonic() + seconds
-        self._task = asyncio.create_task(self._run(*self._subject))
+    def _wanted(self) -> tuple[Mesh, RegisterOptions] | None:
+        mesh = self.session.mesh
+        return None if mesh is None else (mesh, registrar_key(self.session.request()))
 
     def _is_current(self) -> bool:
         """Whether the mesh and the options are those that were examined."""
-        if self._subject is None or self.session.mesh is None:
-            return False
-        mesh, key = self._subject
-        return mesh is self.session.mesh and key == registrar_key(self.session.request())
+        return self._subject is not None and self._subject == self._wanted()
 
     async def _run(self, mesh: Mesh, key: RegisterOptions) -> None:
+        advice = ""
         try:
             advice = await asyncio.to_thread(self.examined, mesh, key)
-            if self._is_current():
-                self.advice = advice
         except _StoppedError:
             self._subject = None  # begins again
         except CurviregError as error:
-            if self._is_current():
-                self.advice = str(error)
+            advice = str(error)
         except Exception:  # a defect must not end the page; the terminal has the traceback
             traceback.print_exc()
         finally:
             self._task = None
+        if self._is_current():
+            self.advice = advice
 
     def examined(self, mesh: Mesh, key: RegisterOptions) -> str:
         """The sentence about a mesh, as it is registered with the options."""
@@ -97,15 +82,12 @@ class Examination:
         self._subject = None
 
     def _report(self, stage: str, done: int, total: int) -> None:
-        """End the examination if it takes too long, if there is another mesh, or if a search needs
-        the processor."""
+        """End the examination if there is another mesh, or if a search needs the processor."""
         is_current = self._is_current()
         if self.waits and stage == "bank" and is_current and not self.session.cancelled:
             self.session.progress = (stage, done, total)
         elif self.waits or not is_current:
             raise _StoppedError("stopped")
-        elif time.monotonic() > self._deadline:
-            raise CurviregError(TOO_LONG)
 
 
 class _StoppedError(CurviregError):

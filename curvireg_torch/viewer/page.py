@@ -8,11 +8,10 @@ from typing import Any
 from nicegui import ui
 
 from ..errors import CurviregError
-from .examination import TOO_LONG
 from .session import STATIC
 from .side import Answers, CameraPanel, Inputs, Preview, Space
 from .stage import Stage
-from .widgets import button, file_chooser, region, set_enabled, set_text, text
+from .widgets import button, file_chooser, mark, region, set_enabled, set_text, text
 from .workspace import Workspace
 
 TICK_SECONDS = 0.15  # between two looks at what changed
@@ -25,13 +24,11 @@ STAGES: Mapping[str, str] = {
 }
 EXAMINING = "Looking for sides that look alike."
 BOX_HINT = (
-    "Drag a rectangle around the object. Without one the whole photograph is searched: "
-    "slower, "
+    "Drag a rectangle around the object. Without one the whole photograph is searched: slower, "
     "less certain."
 )
 BOX_HINT_IN_RIG = (
-    "Drag a rectangle around the object. Where there is none, the other "
-    "photographs say where to "
+    "Drag a rectangle around the object. Where there is none, the other photographs say where to "
     "look."
 )
 
@@ -108,19 +105,13 @@ class Steps:
                     "quiet below",
                 )
                 self.facts["advice"] = text("p", "", "facts", data_testid="mesh-advice")
-                self.examine = button(
-                    "Look all the same",
-                    workspace.examination.start_patiently,
-                    "examine",
-                    "quiet below",
-                )
             with self._step(3, "box"):
                 self.no_box = button(
                     "Remove the box", lambda: self.session.shot.set_box(None), "no-box", "quiet"
                 )
         self.messages["file"] = self._message("file")
         with region("div", "go"):
-            self.find = button("Find the pose", self._find, "register", "primary")
+            self.find = button("Find the pose", workspace.start_search, "register", "primary")
             self.stop = button("Stop", workspace.stop, "stop")
             self.bar = region(
                 "progress", "", max="1", value="0", aria_label="progress of the search"
@@ -144,9 +135,6 @@ class Steps:
     def _message(self, part: str) -> Any:
         return text("p", "", "message", data_testid=f"message-{part}", role="alert")
 
-    def _find(self) -> None:
-        self.workspace.start_search()  # the task outlives the page
-
     def show_messages(self) -> None:
         """Show what the workspace has to say about each part."""
         messages = {"rig": self.session.rig_gaps(), **self.workspace.messages}
@@ -163,14 +151,12 @@ class Steps:
         done = {"photograph": shot.photo, "mesh": session.mesh_path, "box": shot.box or shot.result}
         for name, card in self.cards.items():
             doubtful = bool(done[name] and workspace.messages.get(name))
-            card.classes(**{"add" if done[name] and not doubtful else "remove": "done"})
-            card.classes(**{"add" if doubtful else "remove": "doubt"})
+            mark(card, "done", done[name] and not doubtful)
+            mark(card, "doubt", doubtful)
         set_text(self.facts["photograph"], self._describe_photo())
         set_text(self.facts["mesh"], self._describe_mesh())
-        examining = EXAMINING if workspace.examination.running else ""
-        advice = workspace.examination.advice
-        set_text(self.facts["advice"], advice or examining)
-        self.examine.set_visibility(advice == TOO_LONG)
+        examination = workspace.examination
+        set_text(self.facts["advice"], EXAMINING if examination.running else examination.advice)
         box = " ".join(f"{v:g}" for v in shot.box or ())
         set_text(self.facts["box"], box or (BOX_HINT_IN_RIG if shot.view else BOX_HINT))
         together = len(session.together())
@@ -206,8 +192,7 @@ class Steps:
         path = self.session.mesh_path
         if path is None:
             return (
-                "The object's 3D model: .obj, .stl, .glb, .step, .usdz, or .gltf with its parts "
-                "as "
+                "The object's 3D model: .obj, .stl, .glb, .step, .usdz, or .gltf with its parts as "
                 "a .zip."
             )
         return f"{self.session.name(path)}: {self.session.mesh_facts}"

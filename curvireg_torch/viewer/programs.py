@@ -106,11 +106,9 @@ def command_line(options: RegisterOptions, name: Callable[[Path], str], rig: str
         *(["--views", rig] if rig else list(map(name, options.photos)) or ["PHOTO"]),
     ]
     words += list(map(name, options.meshes)) or ["MESH"]
-    limits = (
-        {}
-        if options.limits is None or not options.limits.keys() - QUALIFIERS
-        else dict(options.limits)
-    )
+    limits = options.limits or {}
+    if not limits.keys() - QUALIFIERS:
+        limits = {}
     values: dict[str, Any] = {
         "box": options.box,
         "camera": "exif" if options.guess == "exif" else options.camera,

@@ -17,7 +17,6 @@ from ..data import Photo, load_camera, read_photo
 from ..errors import (
     MAX_VIEWER_PHOTOGRAPHS,
     CurviregError,
-    CurviregWarning,
     InvalidInputError,
     MissingFileError,
 )
@@ -56,7 +55,8 @@ class Session:
         folder: of uploaded files, which messages call by their names alone.
         shots, shot: the photographs, and the one that is shown; an empty one before the first.
         removed: the photograph that was removed last, and its number.
-        rig_path, rig: the file of a rig, and its rows; none if it could not be read.
+        rig_path, rig: the file of a rig, and its rows by the names of their photographs; none if it
+            could not be read.
         mesh_path, mesh, mesh_facts: the mesh, and what it is in words.
         searched: photographs in which a registration runs.
         progress, cancelled: stage, done and total of a registration; True ends it at its next step.
@@ -68,7 +68,7 @@ class Session:
     shot: Shot = field(default_factory=Shot)
     removed: tuple[int, Shot] | None = None
     rig_path: Path | None = None
-    rig: tuple[Entry, ...] = ()
+    rig: dict[str, Entry] = field(default_factory=dict)
     searched: tuple[Shot, ...] = ()
     mesh_path: Path | None = None
     mesh: Mesh | None = None
@@ -117,7 +117,7 @@ class Session:
         self.mesh_path = None
         self.mesh = None
         self.rig_path = None
-        self.rig = ()
+        self.rig = {}
 
     def open_photo(self, path: Path, box: Numbers | None = None) -> Shot:
         """Add a photograph, and show it; a box in it loses its distortion too."""
@@ -204,38 +204,34 @@ class Session:
         forgotten, as the camera does not fit its photographs, stays."""
         before = self.rig_path, self.rig
         self.rig_path = path
-        self.rig = ()
+        self.rig = {}
         try:
-            self.rig = () if path is None else self._read_rig(path)
+            self.rig = {} if path is None else self._read_rig(path)
             self._match_rig()
         except CurviregError as error:
-            self.rig = ()
+            self.rig = {}
             if path is None:
                 self.rig_path, self.rig = before
                 raise
             self._match_rig()
-            folder = "" if path is None else path if path.is_dir() else path.parent
-            subject = str(error.subject).replace(f"{folder}/", "")
-            subject = subject.replace(str(path), self.rig_name)
+            subject = str(error.subject).replace(str(path), self.rig_name)
             if isinstance(error, MissingFileError):
                 raise MissingFileError("no such file; drop it here", subject=subject) from error
             raise error.with_subject(subject) from error
 
-    def _read_rig(self, path: Path) -> tuple[Entry, ...]:
+    def _read_rig(self, path: Path) -> dict[str, Entry]:
         """The rows of a rig. It comes from anyone who has the address: it names files beside it
         only."""
-        rig = tuple(
-            read_rig(path, self.mesh_path, find=only_in(path if path.is_dir() else path.parent))
-        )
+        views = read_rig(path, self.mesh_path, find=only_in(path if path.is_dir() else path.parent))
         rows = dict[str, Entry]()
-        for view in rig:
+        for view in views:
             same = rows.setdefault(_key(view.photo), view)
             if same is not view:
                 message = (
                     f"{same.name} and {view.name} have the same file name; rename the photographs"
                 )
                 raise InvalidInputError(message, subject=path)
-        return rig
+        return rows
 
     def _match_rig(self) -> None:
         """Give each photograph its row of the rig; the first of several that have one name gets
@@ -251,17 +247,14 @@ class Session:
 
     def _row_of(self, path: Path, shots: Sequence[Shot]) -> Entry | None:
         """The row of the rig with the file name of a photograph, if none of ``shots`` has it."""
-        taken = [_key(shot.path) for shot in shots if shot.view is not None]
-        rows = [
-            view for view in self.rig if _key(view.photo) == _key(path) and _key(path) not in taken
-        ]
-        return rows[0] if rows else None
+        is_taken = any(shot.view and _key(shot.path) == _key(path) for shot in shots)
+        return None if is_taken else self.rig.get(_key(path))
 
     def together(self) -> list[Shot]:
         """The photographs that are registered with the shown one: those of the rig, or it alone."""
         if self.shot.view is None:
             return [self.shot]
-        return [one for view in self.rig for one in self.shots if one.view is view]
+        return [one for view in self.rig.values() for one in self.shots if one.view is view]
 
     @property
     def rig_name(self) -> str:
@@ -274,7 +267,7 @@ class Session:
         if not self.rig:
             return ""
         used = {_key(shot.path) for shot in self.shots if shot.view is not None}
-        missing = [view.photo.name for view in self.rig if _key(view.photo) not in used]
+        missing = [view.photo.name for key, view in self.rig.items() if key not in used]
         others = [shot.path.name for shot in self.shots if shot.view is None]
         gaps = []
         if missing:
@@ -506,12 +499,6 @@ class Session:
     def python(self) -> str:
         """A Python program that gives the answer."""
         return python_program(self.shot, self.usable_name)
-
-    def describe_warning(self, warning: Warning) -> str:
-        """The text of a warning, with the user's name of its file."""
-        if isinstance(warning, CurviregWarning):
-            warning = warning.with_subject(self.name(warning.subject))
-        return str(warning)
 
     def report_progress(self, stage: str, done: int, total: int) -> None:
         """Show progress, and end a registration that was stopped."""

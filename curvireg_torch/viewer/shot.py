@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -64,28 +65,34 @@ class Result:
         answer = self.answer
         if answer.number == 0 and not answer.edits:
             return found
-        order = sorted(range(len(found.hypotheses)), key=lambda k: k != answer.number)
-        probabilities = (
-            ()
-            if answer.edits or not found.probabilities
-            else tuple(found.probabilities[k] for k in order)
-        )
-        hypotheses = (answer.pose, *(found.hypotheses[k] for k in order[1:]))
+        others = [k for k in range(len(found.hypotheses)) if k != answer.number]
+        probabilities = found.probabilities
+        if answer.edits:
+            probabilities = ()
+        elif probabilities:
+            probabilities = tuple(probabilities[k] for k in (answer.number, *others))
         views = found.views
         if views:  # the same pose in the world, which nobody has compared with the photographs
             from_found = torch.linalg.inv(found.transform) @ answer.pose.transform
-            unknown: dict[str, Any] = {
-                "edge_support": None,
-                "similarity": None,
-                "contribution": 0.0,
-            }
             views = tuple(
-                replace(v, T_cam_from_model=v.T_cam_from_model @ from_found, **unknown)
-                for v in views
+                replace(
+                    view,
+                    T_cam_from_model=view.T_cam_from_model @ from_found,
+                    edge_support=None,
+                    similarity=None,
+                    contribution=0.0,
+                )
+                for view in views
             )
-        rest: dict[str, Any] = {"confidence_features": {}, "views": views}
-        rest |= {"axis": None, "pair_probability": None}
-        return replace(found, hypotheses=hypotheses, probabilities=probabilities, **rest)
+        return replace(
+            found,
+            hypotheses=(answer.pose, *(found.hypotheses[k] for k in others)),
+            probabilities=probabilities,
+            confidence_features={},
+            views=views,
+            axis=None,
+            pair_probability=None,
+        )
 
     def centre(self, T: Tensor) -> Tensor:
         """(3,) of the object in the camera, at a (4, 4) pose."""
@@ -288,37 +295,16 @@ def numbers(box: BoxLike) -> Numbers:
 def dragged_box(box: Numbers | None, start: Point, end: Point, *, reach: float) -> Numbers | None:
     """The box in px after a drag: of an edge or corner within ``reach`` px, of all of it from
     inside, or a new one."""
-    (x, y), (u, v) = start, end
-    x0, y0, x1, y1 = box or (math.inf, math.inf, -math.inf, -math.inf)
-    if x0 - reach <= x <= x1 + reach and y0 - reach <= y <= y1 + reach:
-        left, right = _near_edges(x, x0, x1, reach)
-        top, bottom = _near_edges(y, y0, y1, reach)
-        if not (left or right or top or bottom):
-            x0 = x0 + u - x
-            y0 = y0 + v - y
-            x1 = x1 + u - x
-            y1 = y1 + v - y
-        x0 = u if left else x0
-        y0 = v if top else y0
-        x1 = u if right else x1
-        y1 = v if bottom else y1
+    at, to = np.array(start), np.array(end)
+    edges = np.array(box or (np.inf, np.inf, -np.inf, -np.inf)).reshape(2, 2)
+    if (edges[0] - reach <= at).all() and (at <= edges[1] + reach).all():
+        # inside, at most a third of the box is near to an edge
+        inside = np.minimum(reach, (edges[1] - edges[0]) / 3)
+        is_low = at <= edges[0] + inside
+        is_near = np.stack([is_low, ~is_low & (at >= edges[1] - inside)])
+        edges = np.where(is_near, to, edges) if is_near.any() else edges + to - at
     else:
-        x0 = x
-        y0 = y
-        x1 = u
-        y1 = v
-    if min(abs(x1 - x0), abs(y1 - y0)) < MIN_SIDE:
-        return box
-    return (
-        round(min(x0, x1), 1),
-        round(min(y0, y1), 1),
-        round(max(x0, x1), 1),
-        round(max(y0, y1), 1),
-    )
-
-
-def _near_edges(at: float, low: float, high: float, reach: float) -> tuple[bool, bool]:
-    """Whether the low or the high edge is near; inside, at most a third of the box is near to an
-    edge."""
-    inside = min(reach, (high - low) / 3)
-    return at <= low + inside, at > low + inside and at >= high - inside
+        edges = np.stack([at, to])
+    low = edges.min(axis=0)
+    high = edges.max(axis=0)
+    return box if (high - low).min() < MIN_SIDE else numbers([*low.round(1), *high.round(1)])

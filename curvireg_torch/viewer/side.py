@@ -3,7 +3,7 @@ files and box."""
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -32,6 +32,7 @@ from .widgets import (
     fold,
     region,
     set_enabled,
+    set_pressed,
     set_text,
     show_value,
     text,
@@ -58,27 +59,36 @@ VERDICTS = {
 FPS_IN_USE = 20
 FPS_AT_REST = 2
 UNDISTORTED = (
-    "None: the command line takes the box in the photograph as it was taken, the page "
-    "in the "
+    "None: the command line takes the box in the photograph as it was taken, the page in the "
     "undistorted one."
 )
 NOT_IN_RIG = (
-    "None: first write the boxes that were drawn here into the columns x0 to y1 of the "
-    "rig, and "
+    "None: first write the boxes that were drawn here into the columns x0 to y1 of the rig, and "
     "open all photographs."
 )
+EXPECTED = {
+    4: "four numbers fx fy cx cy in px, such as 1450 1450 960 540",
+    1: "the horizontal field of view in degrees, such as 65",
+}
 CONFIDENCE = "estimated probability that this answer is within 30 degrees of the truth"
 CAMERA_HINT = (
     "With it the distance is exact. All photographs have the same: type it and press Enter, or "
     "choose a calibration."
 )
-UNIT_CHOICES: Mapping[str | None, str] = {
-    None: "as the file says, else m",
-    **{unit: unit for unit in UNITS},
+
+
+def _choices(default: str, names: Iterable[str]) -> dict[str | None, str]:
+    """The choices of an option, by their values; None is the default."""
+    return {None: default, **{name: name for name in names}}
+
+
+CHOICES = {
+    "unit": ("unit of the mesh", _choices("as the file says, else m", UNITS)),
+    "up": ("axis that points up", _choices("as the format says", UP_AXES)),
+    "pose": ("how it may stand", _choices("default", ("any", "upright"))),
+    "preset": ("method", _choices("default", PRESET_NAMES)),
 }
-AXES: Mapping[str | None, str] = {None: "as the format says", **{axis: axis for axis in UP_AXES}}
-POSES: Mapping[str | None, str] = {None: "default", "any": "any", "upright": "upright"}
-PRESETS: Mapping[str | None, str] = {None: "default", **{name: name for name in PRESET_NAMES}}
+"""Options that are chosen from a list: their labels and choices."""
 
 
 class Answers:
@@ -146,7 +156,7 @@ class Answers:
             if shot.result is not None:
                 await self._draw_cards(shot)
         for number, card in enumerate(self.cards.default_slot.children):
-            card.props(f"aria-pressed={'true' if answer and number == answer.number else 'false'}")
+            set_pressed(card, answer and number == answer.number)
 
     def _describe(self) -> None:
         document = self.session.document()
@@ -248,17 +258,17 @@ class Answers:
         for number, (pose, picture) in enumerate(zip(hypotheses, pictures, strict=False)):
             degrees = float(rotation_error(pose.rotation, hypotheses[0].rotation))
             url = self.workspace.serve(f"answer-{number}.jpeg", picture, "image/jpeg")
+            name = f"Answer {number + 1}"
+            test_id = f"answer-{number + 1}"
             with (
                 self.cards,
-                region("button", "card", type="button", data_testid=f"answer-{number + 1}") as card,
+                region("button", "card", type="button", data_testid=test_id) as card,
             ):
                 region("img", src=url, alt=f"contours of answer {number + 1}")
-                text(
-                    "span", f"Answer {number + 1}" + (f", {degrees:.0f}° from 1" if number else "")
-                )
+                text("span", f"{name}, {degrees:.0f}° from 1" if number else name)
                 probability = probabilities[number]
                 text("span", "" if probability is None else two_decimals(probability), "facts")
-            card.on("click", lambda number=number: shot.choose(number))
+            card.on("click", partial(shot.choose, number))
 
 
 class Inputs:
@@ -270,10 +280,8 @@ class Inputs:
         self.session = workspace.session
         self.selects: dict[str, Any] = {}
         with fold("Mesh and method", "options", is_open=True):
-            self._select("unit", "unit of the mesh", UNIT_CHOICES)
-            self._select("up", "axis that points up", AXES)
-            self._select("pose", "how it may stand", POSES)
-            self._select("preset", "method", PRESETS)
+            for name, (label, choices) in CHOICES.items():
+                self._select(name, label, choices)
         with fold("The same on the command line, and in Python", "command-line"):
             self.command = self._copied("command")
             self.python = self._copied("python")
@@ -283,13 +291,13 @@ class Inputs:
         text("button", "Copy", "button quiet", type="button", data_copy=name)
         return element
 
-    def _select(self, name: str, label: str, choices: Mapping[Any, str]) -> None:
+    def _select(self, name: str, label: str, choices: dict[str | None, str]) -> None:
         async def changed(event: Any) -> None:
             if event.value != getattr(self.session.options, name):  # not by another window
                 await self.workspace.set_option(name, event.value)
 
         value = getattr(self.session.options, name)
-        select = ui.select(dict(choices), value=value, label=label, on_change=changed)
+        select = ui.select(choices, value=value, label=label, on_change=changed)
         self.selects[name] = select.props(f"dense options-dense data-testid={name}")
 
     async def refresh(self) -> None:
@@ -313,9 +321,9 @@ class CameraPanel:
         with region("div", "fold"):  # a card, which names the camera when its fields are folded
             with fold("Camera", "camera"):
                 text("p", CAMERA_HINT, "facts")
-                self.matrix = field("fx fy cx cy in px", "camera", self._set_matrix)
+                self.matrix = field("fx fy cx cy in px", "camera", partial(self._set, 4))
                 self.view = field(
-                    "or the horizontal field of view in degrees", "fov", self._set_view
+                    "or the horizontal field of view in degrees", "fov", partial(self._set, 1)
                 )
                 with region("div", "row"):
                     file_chooser("From a file", "upload-camera")
@@ -325,16 +333,12 @@ class CameraPanel:
             self.facts = text("p", "", "facts", data_testid="camera-facts")
             self.message = text("p", "", "message", data_testid="message-camera", role="alert")
 
-    async def _set_matrix(self, typed: str) -> None:
-        await self._set(typed, 4, "four numbers fx fy cx cy in px, such as 1450 1450 960 540")
-
-    async def _set_view(self, typed: str) -> None:
-        await self._set(typed, 1, "the horizontal field of view in degrees, such as 65")
-
-    async def _set(self, typed: str, count: int, expected: str) -> None:
+    async def _set(self, count: int, typed: str) -> None:
         found = _typed_numbers(typed, count)
         if found is None:
-            self.workspace.messages["camera"] = f"camera: expected {expected}, got {typed!r:.80}"
+            self.workspace.messages["camera"] = (
+                f"camera: expected {EXPECTED[count]}, got {typed!r:.80}"
+            )
         elif count == 4:
             await self._set_camera(numbers(found) if found else None)
         else:
@@ -362,28 +366,22 @@ class CameraPanel:
     def _describe_camera(self) -> str:
         camera = self.session.options.camera
         guess = self.session.options.guess
-        photo = self.session.shot.photo
-        if self.session.shot.view is not None:
-            return (
-                "of each photograph, from the rig"
-                + ", without its distortion" * self.session.shot.is_undistorted
-            )
-        if guess == "exif" and photo is not None:
-            focal = (
-                f"{photo.focal_35mm:g} mm of a 35 mm camera"
-                if photo.focal_35mm
-                else "has no focal length"
-            )
-            return f"from the photograph's EXIF, {focal}"
+        shot = self.session.shot
+        if shot.view is not None:
+            words = "of each photograph, from the rig"
+            return f"{words}, without its distortion" if shot.is_undistorted else words
+        if guess == "exif" and shot.photo is not None:
+            focal = shot.photo.focal_35mm
+            words = f"{focal:g} mm of a 35 mm camera" if focal else "has no focal length"
+            return f"from the photograph's EXIF, {words}"
         if guess is not None:
             return "from the field of view, to about 10 %"
         if isinstance(camera, Camera):
-            return "from a calibration file" + (
-                ", without its distortion" if camera.distorts else ""
-            )
+            words = "from a calibration file"
+            return f"{words}, without its distortion" if camera.distorts else words
         if camera:
             return ""
-        if photo is not None and photo.camera() is not None:
+        if shot.photo is not None and shot.photo.camera() is not None:
             return "from the photograph's EXIF"
         return "unknown: the focal length is estimated, and the distance with it"
 
@@ -536,15 +534,13 @@ class Space:
         depth = float(shot.require_result().centre(T)[2])
         metres = UNITS[shot.require_result().registrar.bank.mesh.unit or "m"]
         H, W = shot.size
-        corners = [(-0.5, -0.5), (W - 0.5, -0.5), (W - 0.5, H - 0.5), (-0.5, H - 0.5)]
-        rays = [
-            torch.linalg.solve(K.double(), K.new_tensor([x, y, 1]).double()) for x, y in corners
-        ]
+        corners = [[-0.5, -0.5, 1], [W - 0.5, -0.5, 1], [W - 0.5, H - 0.5, 1], [-0.5, H - 0.5, 1]]
+        rays = torch.tensor(corners).double() @ torch.linalg.inv(K.double()).mT
         self.place.clear()
         with self.place, _scene(50) as scene:
             # from glTF's axes, y up, to those of the scene, z up; the object is at distance 1
             scene.gltf(url).rotate(math.pi / 2, 0, 0).scale(1.0 / (depth * metres))
-            for x, y, _ in (ray.tolist() for ray in rays):
+            for x, y, _ in rays.tolist():
                 scene.line([0, 0, 0], [x, 1.0, -y]).material("#0a6b35")
             scene.text("camera", "font-weight: bold; color: #1b1f23").move(0, 0, -0.12)
         scene.move_camera(-0.9, -0.5, 0.6, 0, 0.6, 0, duration=0)

@@ -5,6 +5,7 @@ import time
 from functools import partial
 from typing import Any
 
+import cv2
 import numpy as np
 from nicegui import ui
 from torch import Tensor
@@ -17,7 +18,15 @@ from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink, to_uint8
 from ..visualization.overlay import LEGEND
 from .shot import Numbers, Point, Shot, dragged_box
-from .widgets import button, file_chooser, region, set_enabled, text
+from .widgets import (
+    button,
+    file_chooser,
+    mark,
+    region,
+    set_enabled,
+    set_pressed,
+    text,
+)
 from .workspace import Workspace
 
 PHOTO_SIDE = 2400  # px of the longer side of the displayed photograph, which can be zoomed
@@ -287,7 +296,7 @@ class Stage:
             self.pressed = self.moved = None
             await self._render_answer()
         for element in (self.solid, self.lines):
-            element.classes(**{"add" if shot.answer is None else "remove": "absent"})
+            mark(element, "absent", shot.answer is None)
         self.layers.set_visibility(shot.answer is not None)
         self._draw_shapes()
         await self._show_strip()
@@ -301,28 +310,26 @@ class Stage:
             self.shown["strip"] = images
 
             def make() -> list[bytes]:
-                return [
-                    jpeg(shrink(to_uint8(image), THUMBNAIL_SIDE), 80)
-                    for image in images
-                    if len(images) > 1
-                ]
+                shown = images if len(images) > 1 else []
+                return [jpeg(shrink(to_uint8(image), THUMBNAIL_SIDE), 80) for image in shown]
 
             pictures = await self.workspace.run("page", make) or ()
             self.strip.clear()
             for number, picture in enumerate(pictures):
                 url = self.workspace.serve(f"photograph-{number}.jpg", picture, "image/jpeg")
                 name = self.session.name(shots[number].path)
-                attributes = {
-                    "type": "button",
-                    "title": name,
-                    "data_testid": f"photograph-{number + 1}",
-                }
-                with self.strip, region("button", "thumbnail", **attributes) as thumbnail:
+                test_id = f"photograph-{number + 1}"
+                with (
+                    self.strip,
+                    region(
+                        "button", "thumbnail", type="button", title=name, data_testid=test_id
+                    ) as small,
+                ):
                     region("img", src=url, alt=name)
-                thumbnail.on("click", lambda shot=shots[number]: self._select(shot))
+                small.on("click", partial(self._select, shots[number]))
         for shot, thumbnail in zip(shots, self.strip.default_slot.children, strict=False):
-            thumbnail.props(f"aria-pressed={'true' if shot is self.session.shot else 'false'}")
-            thumbnail.classes(**{"add" if shot.answer is not None else "remove": "done"})
+            set_pressed(thumbnail, shot is self.session.shot)
+            mark(thumbnail, "done", shot.answer)
 
     def _select(self, shot: Shot) -> None:
         self._commit()
@@ -338,7 +345,7 @@ class Stage:
         self.hint.set_content(HELP[self.mode])
         self.touch_hint.set_content(TOUCH_HELP[self.mode])
         for mode, element in self.modes.items():
-            element.props(f"aria-pressed={'true' if mode == self.mode else 'false'}")
+            set_pressed(element, mode == self.mode)
         set_enabled(self.modes["pose"], shot.answer is not None)
         self.fit.set_visibility(is_pose and shot.view is None)
         before = None if shot.result is None else shot.result.answer_before
@@ -393,10 +400,8 @@ class Stage:
             shape = f"x='{x0:g}' y='{y0:g}' width='{x1 - x0:g}' height='{y1 - y0:g}'"
             parts += f"<rect {shape} class='rim'/><rect {shape} class='line'/>"
         if box is not None and is_box:  # squares of the same size at every zoom
-            middle = ((x0 + x1) / 2, (y0 + y1) / 2)
-            points = [
-                (x, y) for x in (x0, middle[0], x1) for y in (y0, middle[1], y1) if (x, y) != middle
-            ]
+            points = [(x, y) for x in (x0, (x0 + x1) / 2, x1) for y in (y0, (y0 + y1) / 2, y1)]
+            del points[4]  # the middle
             path = " ".join(f"M{x:g} {y:g}h0" for x, y in points)
             parts += f"<path d='{path}' class='handle rim'/><path d='{path}' class='handle line'/>"
         self.shapes.set_content(
@@ -406,12 +411,10 @@ class Stage:
 
 def _extent(mask: np.ndarray) -> str:
     """x0 y0 x1 y1 of what is true in a mask, in its widths and heights; "" of an empty one."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
-        return ""
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     H, W = mask.shape
-    box = columns[0] / W, rows[0] / H, (columns[-1] + 1) / W, (rows[-1] + 1) / H
-    return " ".join(f"{v:.4f}" for v in box)
+    box = x / W, y / H, (x + width) / W, (y + height) / H
+    return " ".join(f"{v:.4f}" for v in box) if width else ""
 
 
 def _pose_layers(
@@ -426,7 +429,6 @@ def _pose_layers(
     depth = registrar.describer.renderer.render(T[None], K, small)[0, 0].cpu().float()
     mask: np.ndarray = (depth > 0).numpy()
     grey = shade(depth[None, None], K[None])[0, 0].numpy()
-    solid = np.zeros((*small, 4), np.uint8)
-    solid[mask, :3] = (grey[mask, None] * np.array([255, 235, 190])).round().astype(np.uint8)
-    solid[mask, 3] = 255
+    colour = (grey[..., None] * np.array([255, 235, 190])).round()
+    solid = np.dstack([colour, np.full(small, 255)]).astype(np.uint8) * mask[..., None]
     return png(solid), png(contour_layer(registrar.describer, T, K, small)), mask

@@ -56,6 +56,16 @@ def set_enabled(element: Any, enabled: bool) -> None:
     element.props(remove="disabled") if enabled else element.props("disabled")
 
 
+def mark(element: Any, name: str, is_on: object) -> None:
+    """Give an element a class, or take it."""
+    element.classes(**{"add" if is_on else "remove": name})
+
+
+def set_pressed(element: Any, is_pressed: object) -> None:
+    """Show whether a button is the chosen one of several."""
+    element.props(f"aria-pressed={'true' if is_pressed else 'false'}")
+
+
 def file_chooser(label: str, test_id: str) -> None:
     """A button that opens the dialogue for files; ``page.js`` sends them."""
     with region("label", "button file"):

@@ -135,7 +135,7 @@ class Workspace:
             self._keep_warnings(part, caught)
             return True if result is None else result
         except CurviregError as error:
-            self._show(part, str(error.with_subject(self.session.name(error.subject))))
+            self._show(part, str(error))
         except OSError as error:
             self._show(part, f"{error.strerror or error}; check the machine on which the page runs")
         except Exception as error:  # a defect must not end the page; the terminal has the traceback
@@ -151,7 +151,7 @@ class Workspace:
         if former and self.messages.get(part) == former:
             del self.messages[part]
         if caught:
-            words = "; ".join(map(self.session.describe_warning, caught))
+            words = "; ".join(map(str, caught))
             self._warnings[part] = self.session.without_folders(words)
             self._show(part, words)
 
@@ -431,18 +431,13 @@ def unpack(archive: Path, folder: Path) -> Path:
             if (
                 len(members) > MAX_ARCHIVE_FILES
                 or sum(member.file_size for member in members) > MAX_MESH_BYTES
+                or any(member.filename.count("/") > MAX_ARCHIVE_DEPTH for member in members)
             ):
-                limits = f"{MAX_ARCHIVE_FILES:,} files or {MAX_MESH_BYTES:,} bytes when unpacked"
                 raise InvalidInputError(
-                    f"{name}: more than {limits}; pack only the mesh and its parts"
+                    f"{name}: more than {MAX_ARCHIVE_FILES:,} files, {MAX_MESH_BYTES:,} bytes when "
+                    f"unpacked, or {MAX_ARCHIVE_DEPTH} folders in one another; pack only the mesh "
+                    f"and its parts"
                 )
-            if any(member.filename.count("/") > MAX_ARCHIVE_DEPTH for member in members):
-                message = (
-                    f"folders in more than {MAX_ARCHIVE_DEPTH} folders; pack only the mesh "
-                    f"and "
-                    f"its parts"
-                )
-                raise InvalidInputError(f"{name}: {message}")
             content.extractall(folder)  # at most the bytes that the headers claim
     except InvalidInputError:
         raise

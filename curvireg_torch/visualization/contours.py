@@ -146,16 +146,12 @@ def contour_layer(
     outline = _mask(pixels[is_outline], size)
     object_size = float(np.ptp(pixels, axis=0).max(initial=0.0)) if len(pixels) else 0.0
     inner = _long_lines(_mask(pixels[~is_outline], size), SHORT * object_size) & ~outline
-    drawn = outline | inner
-    if not drawn.any():
+    x, y, across, down = cv2.boundingRect((outline | inner).astype(np.uint8))
+    if not across:
         return layer
     width = _line_width(size)
     margin = int(3 * width) + 2
-    rows = np.nonzero(drawn.any(axis=1))[0]
-    columns = np.nonzero(drawn.any(axis=0))[0]
-    top = max(0, rows[0] - margin)
-    left = max(0, columns[0] - margin)
-    near = np.s_[top : rows[-1] + margin + 1, left : columns[-1] + margin + 1]
+    near = np.s_[max(0, y - margin) : y + down + margin, max(0, x - margin) : x + across + margin]
     to_outline = _distance(outline[near])
     to_inner = _distance(inner[near])
     green = _coverage(to_outline, width / 2)

@@ -91,7 +91,6 @@ def test_a_search_ends_the_examination_which_begins_again(workspace, scene):
     mesh = workspace.session.mesh
     key = module.registrar_key(workspace.session.request())
     examination._subject = mesh, key
-    examination._deadline = time.monotonic() + 10.0
     examination._report("look-alikes", 1, 48)
     examination.waits = True
     examination._report("bank", 3, 7)
@@ -110,17 +109,6 @@ def test_a_search_ends_the_examination_which_begins_again(workspace, scene):
         return await until_done(workspace)
 
     assert asyncio.run(use()).startswith("grey mesh")
-
-
-def test_an_examination_ends_after_its_time(workspace, scene, monkeypatch):
-    monkeypatch.setattr(module, "MAX_SECONDS", -1.0)
-    with_small_bank(workspace, scene)
-
-    async def use():
-        await workspace.open_mesh(scene / "truck.ply")
-        return await until_done(workspace)
-
-    assert asyncio.run(use()) == module.TOO_LONG
 
 
 def test_an_error_is_said_once_and_not_tried_again(workspace, scene, monkeypatch):

@@ -47,7 +47,7 @@ def test_a_rig_on_the_page_reads_no_file_of_the_server(workspace, outside, tmp_p
                 message = workspace.messages["rig"]
                 assert "hunter2" not in message
                 assert str(tmp_path) not in message
-                assert session.rig == ()
+                assert session.rig == {}
                 said.add(message.replace(":cam0", ""))
             assert said == {f"rig.csv: row 1: 0.png: {name}: no such file; drop it here"}
 
@@ -57,7 +57,7 @@ def test_a_calibration_of_the_uploads_is_found_whatever_folder_the_rig_says(work
     for camera in ("cam.json:left", "calibrations/cam.json:left", "C:\\my files\\cam.json:right"):
         session = send(workspace, tmp_path, rig_with_camera(tmp_path, camera), "cam.json")
         assert workspace.messages == {}
-        assert session.rig[0].camera.matrix[0, 2] == 119.5
+        assert next(iter(session.rig.values())).camera.matrix[0, 2] == 119.5
 
 
 def test_photographs_of_a_rig_are_uploads_too(workspace, outside, tmp_path):
@@ -77,6 +77,6 @@ def test_photographs_of_a_rig_are_uploads_too(workspace, outside, tmp_path):
         session = send(workspace, tmp_path, *names)
         assert workspace.messages == {}
         assert len(session.rig) == 3
-        for view in session.rig:
+        for view in session.rig.values():
             assert workspace.folder in view.photo.parents
             assert ".." not in view.photo.parts

@@ -90,7 +90,7 @@ def test_typed_numbers_go_into_the_session(workspace, build):
         asyncio.run(inputs.refresh())
 
     def typed(matrix=None, view=None):
-        asyncio.run(panel._set_view(view) if matrix is None else panel._set_matrix(matrix))
+        asyncio.run(panel._set(1, view) if matrix is None else panel._set(4, matrix))
         refresh()
         return session.options.camera, session.options.guess
 
@@ -142,7 +142,7 @@ def test_what_is_typed_before_the_button_is_pressed_is_what_the_search_uses(
     monkeypatch.setattr(session, "register", lambda: used.append(session.options.camera))
 
     async def type_and_press():
-        typed = asyncio.create_task(panel._set_matrix("536.8 538.2 310.4 241"))
+        typed = asyncio.create_task(panel._set(4, "536.8 538.2 310.4 241"))
         await asyncio.sleep(0)  # as two events of a browser come
         await workspace.start_search()
         await typed

@@ -206,9 +206,9 @@ def test_a_bad_rig_is_named_with_its_row(workspace, rig, tmp_path, column, value
     session = send(workspace, folder, "0.png")
     send(workspace, tmp_path, "rig.csv")
     assert workspace.messages["rig"].startswith(message)
-    assert (session.rig, session.shot.view) == ((), None)
+    assert (session.rig, session.shot.view) == ({}, None)
     send(workspace, folder, "rig.csv")
-    assert (workspace.messages, session.shot.view is session.rig[0]) == ({}, True)
+    assert (workspace.messages, session.shot.view is session.rig["0"]) == ({}, True)
 
 
 def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photographs(
@@ -274,7 +274,7 @@ def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
 
 def test_of_two_photographs_of_one_name_the_first_has_the_row_of_the_rig():
     row = SimpleNamespace(photo=Path("a/0.png"))
-    session = SimpleNamespace(rig=[row, SimpleNamespace(photo=Path("1.png"))])
+    session = SimpleNamespace(rig={"0": row, "1": SimpleNamespace(photo=Path("1.png"))})
     shots = [SimpleNamespace(path=Path("b/0.png"), view=row)]
     assert Session._row_of(session, Path("c/0.PNG"), []) is row
     assert Session._row_of(session, Path("c/0.PNG"), shots) is None

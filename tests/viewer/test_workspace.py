@@ -521,7 +521,7 @@ def test_unpack_refuses_what_is_too_large_damaged_or_not_one_mesh(tmp_path, monk
     # a header that lies
     refused(content.replace(struct.pack("<I", 5000), struct.pack("<I", 10)), "cannot be unpacked")
     monkeypatch.setattr(module, "MAX_MESH_BYTES", 4999)
-    refused(content, "or 4,999 bytes when unpacked")
+    refused(content, "4,999 bytes when unpacked")
     monkeypatch.setattr(module, "MAX_ARCHIVE_FILES", 2)
     refused({f"{k}.txt": b"" for k in range(3)}, "more than 2 files")
     monkeypatch.setattr(zipfile.ZipFile, "infolist", None)  # the directory is not even read
@@ -644,7 +644,7 @@ def test_unpack_refuses_folders_that_are_nested_deeply(tmp_path):
     deep = "a/" * module.MAX_ARCHIVE_DEPTH
     assert unpack(pack(tmp_path / "a.zip", {f"{deep}a.ply": mesh}), tmp_path / "parts").is_file()
     with pytest.raises(
-        InvalidInputError, match=r"^a\.zip: folders in more than 32 folders; pack only"
+        InvalidInputError, match=r"^a\.zip: more than .* 32 folders in one another; pack only"
     ):
         unpack(pack(tmp_path / "a.zip", {f"{deep}a/a.ply": mesh}), tmp_path / "more")
     assert not (tmp_path / "more").exists()
