@@ -1,7 +1,5 @@
 """Calibration files as their tools write them, and damaged ones."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
@@ -134,9 +132,8 @@ def test_opencv_with_other_keys_and_bop(tmp_path, read):
 @pytest.mark.parametrize(
     "text", [ROS, ROS_MESSAGE, ROS.replace("\n", "\r\n")], ids=["file", "message", "windows"]
 )
-def test_ros_camera_info(tmp_path, text):
-    file = tmp_path / "camera_info.yaml"
-    file.write_bytes(text.encode())
+def test_ros_camera_info(write, text):
+    file = write("camera_info.yaml", text.encode())
     check(load_camera(file), tuple(D[0]))
 
 
@@ -154,17 +151,15 @@ def test_other_models_of_ros(read):
         )
 
 
-def test_kalibr(tmp_path):
-    file = tmp_path / "camchain.yaml"
-    file.write_text(KALIBR)
+def test_kalibr(write):
+    file = write("camchain.yaml", KALIBR)
     check(load_camera(f"{file}:cam0"), tuple(D[0, :4]))
     camera = load_camera(f"{file}:cam1")
     assert (camera.model, camera.distortion) == ("fisheye", (0.02, -0.01, 0.003, -0.001))
 
 
-def test_colmap_counts_from_the_corner_of_the_picture(tmp_path):
-    file = tmp_path / "cameras.txt"
-    file.write_text(COLMAP)
+def test_colmap_counts_from_the_corner_of_the_picture(write):
+    file = write("cameras.txt", COLMAP)
     check(load_camera(f"{file}:1"), (), fy=520.5)
     check(load_camera(f"{file}:2"), ())
     check(load_camera(f"{file}:3"), (-0.31, 0.0, 0.0, 0.0), fy=520.5)
@@ -173,7 +168,7 @@ def test_colmap_counts_from_the_corner_of_the_picture(tmp_path):
     check(load_camera(f"{file}:6"), (0.02, -0.01, 0.003, -0.001), model="fisheye")
 
 
-def test_malicious_files_are_refused(tmp_path):
+def test_malicious_files_are_refused(tmp_path, write):
     for name, content, words in (
         (
             "a.yaml",
@@ -184,7 +179,7 @@ def test_malicious_files_are_refused(tmp_path):
         ("a.xml", "<a>" * 100_000 + "</a>" * 100_000, "damaged|nested too deeply"),
         ("a.yaml", " " * (MAX_CAMERA_BYTES + 1), "larger than 4,194,304 bytes"),
     ):
-        (tmp_path / name).write_text(content)
+        write(name, content)
         with pytest.raises(InvalidInputError, match=words) as error:
             load_camera(tmp_path / name)
         assert str(error.value).startswith(f"{tmp_path / name}: ")
@@ -381,19 +376,19 @@ def test_arrays_of_numpy(tmp_path):
     check(load_camera(tmp_path / "K.npy"), (), size=None)
 
 
-def test_arrays_of_objects_and_damaged_ones_are_refused(tmp_path):
+def test_arrays_of_objects_and_damaged_ones_are_refused(tmp_path, write):
     file = tmp_path / "B.npz"
     np.savez(file, mtx=np.array([K.tolist(), "text"], dtype=object))
     with refused("no camera matrix"):
         load_camera(file)
     np.save(tmp_path / "huge.npy", K)
     data = (tmp_path / "huge.npy").read_bytes().replace(b"(3, 3), ", b"(3, 3000000000), ".ljust(8))
-    (tmp_path / "huge.npy").write_bytes(data)
+    write("huge.npy", data)
     for damaged in (tmp_path / "huge.npy", file):
         damaged.write_bytes(damaged.read_bytes()[:150])
         with refused(r"damaged|larger than its file"):
             load_camera(damaged)
-    (tmp_path / "camera.pkl").write_bytes(b"\x80\x04\x95\xff\x00")
+    write("camera.pkl", b"\x80\x04\x95\xff\x00")
     with refused(r"pickle is not read; save it as JSON: json\.dump"):
         load_camera(tmp_path / "camera.pkl")
 
@@ -436,11 +431,10 @@ def test_scenes_of_several_cameras_need_a_choice(read):
         ("exif", 0.05, "given"),
     ],
 )
-def test_the_camera_of_a_result_is_as_uncertain_as_it_was(tmp_path, source, deviation, expected):
+def test_the_camera_of_a_result_is_as_uncertain_as_it_was(read, source, deviation, expected):
     own = {**OWN, "focal_deviation": deviation, "source": source}
     for content in (own, {"camera": own, "inputs": {"camera": None}}):
-        (tmp_path / "result.json").write_text(json.dumps(content))
-        camera = load_camera(tmp_path / "result.json")
+        camera = read(content, "result.json")
         assert (camera.focal_deviation, camera.source) == (deviation, expected)
         assert camera.size == (480, 640)
 
@@ -488,12 +482,12 @@ def test_nerfstudio_fisheye(read):
     )
 
 
-def test_more_models_of_colmap(tmp_path):
-    file = tmp_path / "cameras.txt"
-    file.write_text(
+def test_more_models_of_colmap(write):
+    file = write(
+        "cameras.txt",
         "7 FULL_OPENCV 640 480 520.5 522 321.75 239 -0.31 0.12 0.001 -0.002 0.03 0.5 0.6 0.7\n"
         "8 RADIAL_FISHEYE 640 480 520.5 321.75 239 0.02 -0.01\n9 FOV 640 480 520.5 522 321.75 239 "
-        "0.1\n"
+        "0.1\n",
     )
     check(load_camera(f"{file}:7"), (*LENS, 0.5, 0.6, 0.7))
     check(load_camera(f"{file}:8"), (0.02, -0.01, 0.0, 0.0), fy=520.5, model="fisheye")
@@ -604,8 +598,8 @@ def test_distortion_beside_several_cameras_belongs_to_none_of_them(read):
         ("<a>", "<b/>", "</a>"),
     ],
 )
-def test_calibrations_are_read_in_linear_time(tmp_path, head, part, end):
+def test_calibrations_are_read_in_linear_time(tmp_path, write, head, part, end):
     def make(count):
-        (tmp_path / "cam").write_text(head + part * count + end)
+        write("cam", head + part * count + end)
 
     check_linear(lambda _: load_camera(tmp_path / "cam"), make, 5_000)

@@ -228,9 +228,8 @@ def test_kitti_names_its_projection_matrices(tmp_path):
         load_camera(file)
 
 
-def test_a_binary_model_of_colmap_is_named(tmp_path):
-    file = tmp_path / "cameras.bin"
-    file.write_bytes(b"\1" + b"\0" * 60)
+def test_a_binary_model_of_colmap_is_named(write):
+    file = write("cameras.bin", b"\1" + b"\0" * 60)
     with refused("colmap model_converter --output_type TXT"):
         load_camera(file)
 
@@ -294,8 +293,7 @@ def test_cameras_that_are_not_read_say_how_to_write_them(tmp_path, content, word
     check_refused(tmp_path, content, words)
 
 
-def test_a_camera_with_fx_is_none_of_metashape(tmp_path):
+def test_a_camera_with_fx_is_none_of_metashape(write):
     values = {"f": 1.0, "type": "frame", "fx": 500.0, "fy": 400.0, "cx": 320.0, "cy": 240.0}
-    file = tmp_path / "camera.json"
-    file.write_text(json.dumps(values))
+    file = write("camera.json", json.dumps(values))
     assert load_camera(file).matrix.diagonal().tolist() == [500.0, 400.0, 1.0]

@@ -72,22 +72,22 @@ def test_heic_is_bounded_by_its_header(written, monkeypatch):
         open_photograph(file.read_bytes())
 
 
-def test_damaged_heic_is_refused_in_one_line(written, tmp_path):
+def test_damaged_heic_is_refused_in_one_line(written, tmp_path, write):
     data = written().read_bytes()
     for cut in (40, len(data) // 2, len(data) - 100):
-        (tmp_path / "cut.heic").write_bytes(data[:cut])
+        write("cut.heic", data[:cut])
         with pytest.raises(ImageError, match=r"cut\.heic: damaged or truncated") as error:
             read_photo(tmp_path / "cut.heic")
         assert "\n" not in str(error.value)
 
 
-def test_a_missing_decoder_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
-    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + b"\0" * 99)
+def test_a_missing_decoder_is_named_with_the_command_that_installs_it(tmp_path, write, monkeypatch):
+    write("a.heic", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + b"\0" * 99)
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     with refused(r"a\.heic: HEIC needs pi-heif: pip install .*heic", MissingDependencyError):
         read_photo(tmp_path / "a.heic")
     monkeypatch.setattr(features, "check", lambda _: False)
-    (tmp_path / "a.avif").write_bytes(b"\0\0\0\x18ftypavif\0\0\0\0mif1miaf" + b"\0" * 99)
+    write("a.avif", b"\0\0\0\x18ftypavif\0\0\0\0mif1miaf" + b"\0" * 99)
     with refused(r"a\.avif: AVIF needs Pillow 11\.3", MissingDependencyError):
         read_photo(tmp_path / "a.avif")
 

@@ -13,18 +13,6 @@ from tests.formats.meshes.packages import threemf
 
 
 @pytest.fixture
-def write(tmp_path):
-    """Write a file, of a text or of bytes, and return its path."""
-
-    def written(name, content):
-        path = tmp_path / name
-        path.write_bytes(content) if isinstance(content, bytes) else path.write_text(content)
-        return path
-
-    return written
-
-
-@pytest.fixture
 def here(monkeypatch):
     """OpenUSD and OpenCascade read in this process: one of their own takes a second to start."""
 

@@ -28,9 +28,8 @@ def needs(package):
 @needs("cascadio")
 @pytest.mark.usefixtures("here")
 @pytest.mark.parametrize(("unit", "suffix"), [("cm", "step"), ("in", "STP")])
-def test_step_files_keep_their_unit_and_axes(tmp_path, load, unit, suffix):
-    path = tmp_path / f"part.{suffix}"
-    path.write_text(step_file((3.0, 2.0, 1.0), unit))
+def test_step_files_keep_their_unit_and_axes(write, load, unit, suffix):
+    path = write(f"part.{suffix}", step_file((3.0, 2.0, 1.0), unit))
     mesh, texts = load(path)
     assert (mesh.unit, mesh.up, texts) == (unit, "z", [])
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 2, 1]], atol=1e-6)
@@ -69,9 +68,8 @@ def test_damaged_step_files_are_refused(refused, content):
 
 
 @needs("cascadio")
-def test_step_files_are_bounded_in_size_and_time(tmp_path, monkeypatch):
-    path = tmp_path / "part.step"
-    path.write_text(step_file((3.0, 2.0, 1.0), "mm"))
+def test_step_files_are_bounded_in_size_and_time(write, monkeypatch):
+    path = write("part.step", step_file((3.0, 2.0, 1.0), "mm"))
     for name, value, match in (
         ("MAX_CAD_BYTES", 99, "larger than 99 bytes"),
         ("MAX_MESH_BYTES", 99, "more than 99 bytes"),
@@ -187,9 +185,9 @@ def collada(asset="", image="label.png", nodes="", more=""):
         ("", "m", "y", 1.0),
     ],
 )
-def test_collada_files_keep_their_unit_and_axes(tmp_path, load, asset, unit, up, scale):
-    (tmp_path / "a.dae").write_text(collada(asset))
-    (tmp_path / "label.png").write_bytes(encoded(noise()))
+def test_collada_files_keep_their_unit_and_axes(tmp_path, write, load, asset, unit, up, scale):
+    write("a.dae", collada(asset))
+    write("label.png", encoded(noise()))
     mesh, texts = load(tmp_path / "a.dae")
     assert (mesh.unit, mesh.up, texts) == (unit, up, [])
     np.testing.assert_allclose(mesh.bounds, np.array([[10, 0, 0], [14, 2, 0]]) * scale, atol=1e-6)
@@ -200,8 +198,8 @@ def test_collada_files_keep_their_unit_and_axes(tmp_path, load, asset, unit, up,
 
 
 @needs("collada")
-def test_collada_names_textures_that_it_cannot_use(tmp_path, write, load):
-    (tmp_path / "label.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
+def test_collada_names_textures_that_it_cannot_use(write, load):
+    write("label.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
     for image, match in (
         ("no.png", "no.png is missing"),
         ("../x.png", "lies outside"),

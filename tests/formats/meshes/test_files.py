@@ -69,17 +69,15 @@ STARTS = {
 
 @pytest.mark.parametrize("suffix", ["obj", "stl", "glb", "ply", "3mf"])
 @pytest.mark.parametrize(("start", "words"), STARTS.items())
-def test_what_a_download_leaves_in_place_of_a_mesh_is_named(tmp_path, suffix, start, words):
-    path = tmp_path / f"a.{suffix}"
-    path.write_bytes(start)
+def test_what_a_download_leaves_in_place_of_a_mesh_is_named(write, suffix, start, words):
+    path = write(f"a.{suffix}", start)
     with refused(words, MeshError):
         load_mesh(path)
 
 
 @pytest.mark.parametrize(("kind", "name"), [("ply", "a.obj"), ("glb", "b.stl")])
-def test_a_mesh_under_the_name_of_another_kind_is_named(tmp_path, kind, name):
-    path = tmp_path / name
-    path.write_bytes(trimesh.creation.box().export(file_type=kind))
+def test_a_mesh_under_the_name_of_another_kind_is_named(write, kind, name):
+    path = write(name, trimesh.creation.box().export(file_type=kind))
     with refused(rf"of another kind than its name says; name it \.{kind}", MeshError):
         load_mesh(path)
 

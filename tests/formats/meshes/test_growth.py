@@ -19,7 +19,7 @@ from curvireg_torch.utils.extras import is_installed
 from curvireg_torch.utils.programs import run_program
 from tests._support.refusals import refused
 from tests.formats.meshes.packages import threemf as write_package
-from tests.formats.meshes.pictures import painted
+from tests.formats.meshes.pictures import encoded, painted
 from tests.formats.meshes.step import step_file
 from tests.formats.meshes.test_cad import collada
 from tests.formats.meshes.test_gltf import skinned
@@ -136,8 +136,25 @@ def part_of_image(count, image, **more):
     return content
 
 
+def data_uri(picture):
+    return {"uri": f"data:image/png;base64,{base64.b64encode(picture).decode()}"}
+
+
+def test_a_texture_is_decoded_once(write, monkeypatch):
+    """Few bytes unpack to a large picture, which many parts share."""
+    picture = encoded(np.full((4096, 4096, 3), (200, 100, 50), np.uint8))
+    content = part_of_image(20, data_uri(picture))
+    content["nodes"] = [{"mesh": i % 20, "translation": [i, 0, 0]} for i in range(40)]
+    content["scenes"] = [{"nodes": list(range(40))}]
+    decode = Mock(wraps=colours._texture)
+    monkeypatch.setattr(colours, "_texture", decode)
+    found = cr.load_mesh(write("a.gltf", json.dumps(content))).colours
+    assert (decode.call_count, len(found)) == (1, 40)
+    (texture,) = found.textures
+    assert texture[9, 9].tolist() == [200, 100, 50]
+
+
 def test_bytes_of_a_shared_image_are_made_once(tmp_path, monkeypatch):
-    coded = base64.b64encode(PICTURE).decode()
     points = tree()["buffers"][0]
     views = [*tree()["bufferViews"], {"buffer": 1, "byteLength": len(PICTURE)}]
     decode = Mock(wraps=gltf._data_of)
@@ -153,11 +170,11 @@ def test_bytes_of_a_shared_image_are_made_once(tmp_path, monkeypatch):
     path = tmp_path / "a.gltf"
     for count in (5, 10):
         decode.reset_mock()
-        path.write_text(json.dumps(part_of_image(count, {"uri": f"data:image/png;base64,{coded}"})))
+        path.write_text(json.dumps(part_of_image(count, data_uri(PICTURE))))
         assert len(cr.load_mesh(path).colours.textures) == 1
         assert decode.call_count == 2  # the buffer and the image
         viewed.clear()
-        buffers = [points, {"uri": f"data:;base64,{coded}", "byteLength": len(PICTURE)}]
+        buffers = [points, {**data_uri(PICTURE), "byteLength": len(PICTURE)}]
         shared = part_of_image(count, {"bufferView": 1}, buffers=buffers, bufferViews=views)
         path.write_text(json.dumps(shared))
         assert len(cr.load_mesh(path).colours.textures) == 1
@@ -218,9 +235,9 @@ def test_names_that_no_file_has(name, is_possible):
     assert is_file_name(name) == is_possible
 
 
-def test_a_long_name_of_a_texture_leaves_the_mesh_alone(tmp_path, load):
-    (tmp_path / "a.mtl").write_text(f"newmtl m\nKd 1 0 0\nmap_Kd {'x' * 8000}.png\n")
-    (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
+def test_a_long_name_of_a_texture_leaves_the_mesh_alone(tmp_path, write, load):
+    write("a.mtl", f"newmtl m\nKd 1 0 0\nmap_Kd {'x' * 8000}.png\n")
+    write("a.obj", "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
     mesh, texts = load(tmp_path / "a.obj")
     assert len(mesh.faces) == 1
     assert texts == [
@@ -255,8 +272,8 @@ def test_a_texture_of_many_groups_is_unpacked_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(not is_installed("collada"), reason="collada is not installed")
-def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(tmp_path, monkeypatch):
-    (tmp_path / "label.png").write_bytes(PICTURE)
+def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(tmp_path, write, monkeypatch):
+    write("label.png", PICTURE)
     path = tmp_path / "a.dae"
     text = collada()
     materials = "".join(
@@ -298,15 +315,15 @@ def test_a_program_has_limits_of_time_and_memory(tmp_path):
 
 
 @pytest.mark.skipif(not is_installed("cascadio"), reason="cascadio is not installed")
-def test_opencascade_has_a_limit_of_memory(tmp_path, monkeypatch):
-    (tmp_path / "a.step").write_text(step_file((3.0, 2.0, 1.0), "mm"))
+def test_opencascade_has_a_limit_of_memory(tmp_path, write, monkeypatch):
+    write("a.step", step_file((3.0, 2.0, 1.0), "mm"))
     monkeypatch.setattr(cad, "MAX_CAD_MEMORY", 1 << 28)
     with refused(r"OpenCASCADE (needs more than|finds no shape)", MeshError):
         cr.load_mesh(tmp_path / "a.step")
 
 
 @pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
-def test_usd_drops_unused_points_before_they_are_copied(tmp_path, monkeypatch):
+def test_usd_drops_unused_points_before_they_are_copied(write, monkeypatch):
     points = ", ".join(["(9, 9, 9)"] * 1000 + ["(0, 0, 0)", "(1, 0, 0)", "(0, 1, 0)"])
     text = f"""#usda 1.0
 def Xform "a" (
@@ -327,11 +344,11 @@ def "b" (
 {{
 }}
 """
-    (tmp_path / "a.usda").write_text(text)
-    _, arrays = usd._parts_of(tmp_path / "a.usda")
+    path = write("a.usda", text)
+    _, arrays = usd._parts_of(path)
     for key in ("0.", "1."):
         assert arrays[key + "points"].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
         assert arrays[key + "indices"].tolist() == [0, 1, 2]
     monkeypatch.setattr(usd, "MAX_CAD_MEMORY", 1 << 27)
     with refused(r"OpenUSD (needs more than|cannot read)", MeshError):
-        cr.load_mesh(tmp_path / "a.usda")
+        cr.load_mesh(path)

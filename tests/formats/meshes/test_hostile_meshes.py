@@ -6,17 +6,14 @@ import math
 import struct
 import time
 import tracemalloc
-from io import BytesIO
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
-from curvireg_torch.formats.meshes import colours, limits, polygons, source
+from curvireg_torch.formats.meshes import limits, polygons, source
 from curvireg_torch.mesh import mesh as mesh_module
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
@@ -60,9 +57,9 @@ def refused(path, content, match, *, seconds=5.0, megabytes=100.0):
     assert path.name in str(caught.value)
 
 
-def test_load_mesh_reads_the_valid_gltf_and_glb_and_refuses_damaged_glb(tmp_path):
-    (tmp_path / "a.gltf").write_text(json.dumps(tree()))
-    (tmp_path / "a.glb").write_bytes(glb(tree()))
+def test_load_mesh_reads_the_valid_gltf_and_glb_and_refuses_damaged_glb(tmp_path, write):
+    write("a.gltf", json.dumps(tree()))
+    write("a.glb", glb(tree()))
     areas = [cr.load_mesh(tmp_path / name).surface.area for name in ("a.gltf", "a.glb")]
     assert areas == [0.5, 0.5]
     for damaged in (
@@ -120,34 +117,6 @@ def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path):
         refused(tmp_path / "a.gltf", json.dumps(tree(**changes)).encode(), match)
         if "buffers" not in changes:
             refused(tmp_path / "a.glb", glb(tree(**changes)), match)
-
-
-def test_load_mesh_decodes_a_texture_once(tmp_path, monkeypatch):
-    """Few bytes unpack to a large picture, which many parts share."""
-    picture = BytesIO()
-    Image.new("RGB", (4096, 4096), (200, 100, 50)).save(picture, "PNG")
-    uri = "data:image/png;base64," + base64.b64encode(picture.getvalue()).decode()
-    content = tree(
-        nodes=[{"mesh": i % 20, "translation": [i, 0, 0]} for i in range(40)],
-        scenes=[{"nodes": list(range(40))}],
-        meshes=[
-            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": i}]}
-            for i in range(20)
-        ],
-        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}] * 20,
-        textures=[{"source": 0}],
-        images=[{"uri": uri}],
-    )
-    content["accessors"].append(
-        {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}
-    )
-    (tmp_path / "a.gltf").write_text(json.dumps(content))
-    decode = Mock(wraps=colours._texture)
-    monkeypatch.setattr(colours, "_texture", decode)
-    found = cr.load_mesh(tmp_path / "a.gltf").colours
-    assert (decode.call_count, len(found)) == (1, 40)
-    (texture,) = found.textures
-    assert texture[9, 9].tolist() == [200, 100, 50]
 
 
 OUTSIDE = [
@@ -214,7 +183,7 @@ def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path, monkeypatc
     refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
 
 
-def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path):
+def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path, write):
     """trimesh alone multiplies the whole chain again for each part."""
     half_degree = {
         "rotation": [0.0, 0.0, math.sin(math.radians(0.25)), math.cos(math.radians(0.25))]
@@ -222,7 +191,7 @@ def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path):
     chain = [{"children": [i + 1], "translation": [0.01, 0, 0], **half_degree} for i in range(179)]
     leaves = [{"mesh": 0, "translation": [0, 0, 0.1 * i]} for i in range(500)]
     nodes = [*chain, {"children": list(range(180, 680))}, *leaves]
-    (tmp_path / "a.gltf").write_text(json.dumps(tree(nodes=nodes)))
+    write("a.gltf", json.dumps(tree(nodes=nodes)))
     start = time.process_time()
     mesh = cr.load_mesh(tmp_path / "a.gltf")
     assert time.process_time() - start < 10
@@ -235,13 +204,13 @@ def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path):
         assert np.abs(vertices - [point.real, point.imag, 0.7]).max(axis=1).min() < 1e-6
 
 
-def test_divide_faces_counts_before_it_divides(tmp_path, monkeypatch):
+def test_faces_are_counted_before_they_are_divided(tmp_path, write, monkeypatch):
     dart = b"OFF\n4 %d 0\n0 0 0\n1 2 0\n0 1 0\n-1 2 0\n" + b"4 0 1 2 3\n" * 10
     ply = PLY.replace(b"9000000", b"10") % (b"ascii", 4) + dart.split(b"\n", 2)[2]
     obj = b"v 0 0 0\nv 1 2 0\nv 0 1 0\nv -1 2 0\n" + b"f 1 2 3 4\n" * 10
     for name, content in (("a.off", dart % 10), ("a.ply", ply), ("a.obj", obj)):
         monkeypatch.undo()
-        (tmp_path / name).write_bytes(content)
+        write(name, content)
         assert len(cr.load_mesh(tmp_path / name).faces) == 20
         monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 159)
         refused(tmp_path / name, content, "not convex have too many corners")

@@ -156,10 +156,10 @@ def test_parts_keep_their_own_colours_and_textures(loaded):
     assert first_corners(mesh) == [RED, BLUE, WHITE, WHITE]
 
 
-def test_a_picture_as_webp_wins(tmp_path, loaded):
+def test_a_picture_as_webp_wins(write, loaded):
     tree = textured({})
     tree.content["images"] += [{"uri": "b.png"}]
-    (tmp_path / "b.png").write_bytes(painted((0, 255, 0)))
+    write("b.png", painted((0, 255, 0)))
     tree.content["textures"] = [{"source": 0, "extensions": {"EXT_texture_webp": {"source": 1}}}]
     assert textures(loaded(tree)) == [GREEN]
 
@@ -192,8 +192,8 @@ def test_colours_of_vertices_win_over_those_of_materials(tmp_path):
     assert first_corners(cr.load_mesh(path)) == [GREEN]
 
 
-def test_a_face_has_a_texture_if_all_its_corners_have_coordinates(tmp_path):
-    (tmp_path / "a.png").write_bytes(painted((0, 255, 0)))
+def test_a_face_has_a_texture_if_all_its_corners_have_coordinates(tmp_path, write):
+    write("a.png", painted((0, 255, 0)))
     path = obj(tmp_path, {"a.mtl": "newmtl m\nKd 1 0 0\nmap_Kd a.png\n"}, "vt 0 0\nvt 1 1\n")
     text = path.read_text().replace("f 1 2 3\n", "")
     path.write_text(f"{text}f 1/1 2/2 3/2\nf 1/1 2/2 3\nf 1 2 3\n")
@@ -202,9 +202,8 @@ def test_a_face_has_a_texture_if_all_its_corners_have_coordinates(tmp_path):
     assert first_corners(mesh) == [WHITE, RED, RED]
 
 
-def test_weights_of_vertices_divide(tmp_path):
-    path = tmp_path / "a.obj"
-    path.write_text("v 0 0 0 1\nv 2 0 0 2\nv 0 3 0\nv 0 0 4 0\nf 1 2 3\nf 1 2 4\n")
+def test_weights_of_vertices_divide(write):
+    path = write("a.obj", "v 0 0 0 1\nv 2 0 0 2\nv 0 3 0\nv 0 0 4 0\nf 1 2 3\nf 1 2 4\n")
     mesh = cr.load_mesh(path)
     assert mesh.bounds.tolist() == [[0, 0, 0], [1, 3, 4]]
 
@@ -313,10 +312,10 @@ def test_a_colour_of_a_visual_wins_over_a_named_one(tmp_path, load):
     assert first_corners(load(robot(tmp_path, box + bare, more=named))[0])[0] == RED
 
 
-def test_colours_of_a_mesh_win_over_those_of_the_urdf(tmp_path, load):
+def test_colours_of_a_mesh_win_over_those_of_the_urdf(tmp_path, write, load):
     names = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
     text = header(names, "") + rows(["0 255 0"] * 4) + "3 0 1 2\n3 0 2 3\n"
-    (tmp_path / "a.ply").write_text(text)
+    write("a.ply", text)
     shape = '<geometry><mesh filename="a.ply"/></geometry>'
     own = '<material name="m"><color rgba="0 0 1 1"/></material>'
     assert first_corners(load(robot(tmp_path, shape + own))[0]) == [GREEN, GREEN]
@@ -467,9 +466,9 @@ def test_names_do_not_lead_out_of_a_folder_of_textures(tmp_path, write):
         assert source.read_optional("texture", name) is None
 
 
-def test_a_mesh_of_a_robot_may_use_files_of_the_robots_folder(tmp_path):
+def test_a_mesh_of_a_robot_may_use_files_of_the_robots_folder(tmp_path, write):
     (tmp_path / "meshes").mkdir()
-    (tmp_path / "a.mtl").write_text("newmtl red")
+    write("a.mtl", "newmtl red")
     (tmp_path / "meshes" / "a.obj").write_text("")
     robot = MeshSource(tmp_path / "a.urdf")
     part = robot.beside(tmp_path / "meshes" / "a.obj")

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from tests._support.doubling import check_linear
 from tests.formats.meshes.pictures import encoded, noise
 
 POINTS = [(0, 0, 0), (4, 0, 0), (4, 2, 0), (0, 2, 0)]
@@ -91,9 +90,9 @@ def test_concave_faces_keep_their_texture_coordinates(tmp_path, write, load):
 
 
 @pytest.mark.parametrize("encoding", ["latin-1", "gbk", "utf-8", "utf-8-sig"])
-def test_remarks_in_any_encoding(tmp_path, write, load, encoding):
+def test_remarks_in_any_encoding(write, load, encoding):
     name = "外壳" if encoding == "gbk" else "Gehäuse"
-    (tmp_path / f"{name}.png").write_bytes(encoded(noise()))
+    write(f"{name}.png", encoded(noise()))
     comments = f"comment made for {name}\nobj_info {name}\ncomment TextureFile {name}.png\n"
     vertex = "property float s\nproperty float t\n"
     text = header(vertex, "", comments=comments) + rows(["0 0", "1 0", "1 1", "0 1"]) + FACES
@@ -122,20 +121,3 @@ def test_headers_of_many_columns_are_refused(refused):
         header(columns, "", kind="binary_little_endian"),
         "more than 500 kinds of rows or columns",
     )
-
-
-HOSTILE = {  # comments
-    "comments": lambda n: "comment\n" * n,
-    "blanks": lambda n: f"comment{' ' * 20 * n}x\n",
-    "textures": lambda n: "comment TextureFile a.png\n" * n,
-}
-
-
-@pytest.mark.parametrize("kind", HOSTILE)
-def test_time_grows_with_the_size(tmp_path, load, kind):
-    def written(n):
-        path = tmp_path / "a.ply"
-        path.write_text(header("", "", comments=HOSTILE[kind](n)) + rows([""] * 4) + FACES)
-        return path
-
-    check_linear(load, written, 5_000)

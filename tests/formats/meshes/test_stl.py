@@ -6,10 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-import curvireg_torch as cr
-from curvireg_torch.errors import MeshError
-from tests._support.doubling import check_linear
-
 BOX = trimesh.creation.box((3.0, 2.0, 1.0))
 
 
@@ -116,23 +112,3 @@ def test_an_ascii_file_that_is_cut_in_a_face_is_refused(refused, end):
 )
 def test_damaged_files_are_refused(refused, content, match):
     refused("a.stl", content, match)
-
-
-HOSTILE = {
-    "vertex": lambda n: "solid a\n" + "vertex" + " " * 20 * n + "\n",
-    "blanks": lambda n: "solid a\n" + " " * 20 * n + "x\n",
-    "lines": lambda n: "solid a\n" + " \n" * 20 * n,
-    "end": lambda n: "solid a\n" + "end " * 10 * n + "\n",
-}
-
-
-@pytest.mark.parametrize("kind", HOSTILE)
-def test_time_grows_with_the_size(tmp_path, kind):
-    def written(n):
-        path = tmp_path / "a.stl"
-        path.write_text(HOSTILE[kind](n))
-        return path
-
-    with pytest.raises(MeshError):
-        cr.load_mesh(written(100))
-    check_linear(cr.load_mesh, written, 5_000)

@@ -50,8 +50,8 @@ def test_only_the_formats_of_photographs_are_decoded(tmp_path, load, monkeypatch
     assert all("not an image that is read" in text for text in texts)
 
 
-def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path):
-    (tmp_path / "a.eps").write_bytes(POSTSCRIPT)
+def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path, write):
+    write("a.eps", POSTSCRIPT)
     mesh = trimesh.creation.box()
     with Image.open(tmp_path / "a.eps") as picture:
         mesh.visual = trimesh.visual.TextureVisuals(uv=mesh.vertices[:, :2], image=picture)
@@ -59,11 +59,11 @@ def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path):
             assert as_mesh(mesh).colours is None
 
 
-def test_pixels_of_all_textures_together_are_bounded(tmp_path, load, monkeypatch):
+def test_pixels_of_all_textures_together_are_bounded(tmp_path, write, load, monkeypatch):
     content = picture("PNG", (40, 25))
     path = write_obj(tmp_path, "".join(f"newmtl m{k}\nmap_Kd {k}.png\n" for k in range(4)))
     for k in range(4):
-        (tmp_path / f"{k}.png").write_bytes(content)
+        write(f"{k}.png", content)
     head, _, faces = path.read_text().partition("usemtl label\n")
     rows = faces.splitlines(keepends=True)
     parts = [f"usemtl m{k}\n" + "".join(rows[3 * k : 3 * k + 3]) for k in range(4)]

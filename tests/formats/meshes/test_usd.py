@@ -112,9 +112,8 @@ def test_places_units_axes_and_polygons(tmp_path, load):
         ('upAxis = "Z"', "cm", "z", 2.0),  # not stated: OpenUSD's centimetres
     ],
 )
-def test_units_and_axes_are_those_of_the_stage(tmp_path, load, about, unit, up, width):
-    path = tmp_path / "part.usda"
-    path.write_text(stage(square(), about=about))
+def test_units_and_axes_are_those_of_the_stage(write, load, about, unit, up, width):
+    path = write("part.usda", stage(square(), about=about))
     mesh, _ = load(path)
     assert (mesh.unit, mesh.up) == (unit, up)
     assert mesh.extents[0] == pytest.approx(width)
@@ -122,11 +121,10 @@ def test_units_and_axes_are_those_of_the_stage(tmp_path, load, about, unit, up, 
         assert load(path, unit="mm")[0].unit == "mm"
 
 
-def test_colours_of_the_mesh(tmp_path, load):
+def test_colours_of_the_mesh(write, load):
     colours = "color3f[] primvars:displayColor = [(1, 0, 0), (0, 0, 1)]"
     more = colours + ' (interpolation = "uniform")'
-    path = tmp_path / "part.usda"
-    path.write_text(stage(square(more, counts="3, 3", indices="0, 1, 2, 0, 2, 3")))
+    path = write("part.usda", stage(square(more, counts="3, 3", indices="0, 1, 2, 0, 2, 3")))
     mesh, _ = load(path)
     found = mesh.colours
     assert found.corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
@@ -158,7 +156,7 @@ def test_textures_by_the_coordinates_that_they_name(tmp_path, load, kind):
         assert any("print.png is missing" in text for text in load(path)[1])
 
 
-def test_textures_lie_beside_the_file_that_names_them(tmp_path, load):
+def test_textures_lie_beside_the_file_that_names_them(tmp_path, write, load):
     """A file of the same name beside the first one is another texture."""
     for folder, colour in ((".", (255, 0, 0)), ("blue", (0, 0, 255))):
         (tmp_path / folder / "textures").mkdir(parents=True)
@@ -167,8 +165,7 @@ def test_textures_lie_beside_the_file_that_names_them(tmp_path, load):
     material = MATERIAL.replace("@textures", "@./textures")
     text = stage(material, square(MAP, BOUND), about='defaultPrim = "part"')
     (tmp_path / "blue" / "part.usda").write_text(text)
-    path = tmp_path / "all.usda"
-    path.write_text('#usda 1.0\ndef "a" (references = @blue/part.usda@)\n{\n}\n')
+    path = write("all.usda", '#usda 1.0\ndef "a" (references = @blue/part.usda@)\n{\n}\n')
     mesh, texts = load(path)
     assert (textures_of(mesh), texts) == ([[0, 0, 255]], [])
     (tmp_path / "blue" / "textures" / "print.png").unlink()
@@ -182,8 +179,8 @@ def test_textures_lie_beside_the_file_that_names_them(tmp_path, load):
         assert (textures_of(mesh), texts) == ([[0, 255, 0]], [])
 
 
-def test_a_texture_whose_file_is_an_input_of_the_material(tmp_path, write, load):
-    (tmp_path / "print.png").write_bytes(painted((1, 2, 3)))
+def test_a_texture_whose_file_is_an_input_of_the_material(write, load):
+    write("print.png", painted((1, 2, 3)))
     named = MATERIAL.replace(
         "asset inputs:file = @textures/print.png@",
         "asset inputs:file.connect = </part/paint.inputs:picture>",
@@ -210,11 +207,11 @@ def test_textures_are_scaled(tmp_path, load):
         assert colours.corners[0, 0].tolist() == tint
 
 
-def test_references_stay_in_the_folder(tmp_path, load):
+def test_references_stay_in_the_folder(tmp_path, write, load):
     (tmp_path / "in").mkdir()
     part = '#usda 1.0\n(\n    defaultPrim = "part"\n)\ndef Xform "part"\n{' + square() + "}\n"
     (tmp_path / "in" / "other.usda").write_text(part)
-    (tmp_path / "other.usda").write_text(part)
+    write("other.usda", part)
     text = '#usda 1.0\ndef "a" (references = @{name}@)\n{{\n}}\n'
     path = tmp_path / "in" / "part.usda"
     path.write_text(text.format(name="./other.usda"))
@@ -253,10 +250,9 @@ def test_other_parts_are_named(write, load):
     assert any("no meshes are left out (Cube)" in text for text in texts)
 
 
-def test_bounds(tmp_path, monkeypatch):
+def test_bounds(write, monkeypatch):
     monkeypatch.undo()  # in a process of its own
-    path = tmp_path / "part.usda"
-    path.write_text(stage(square()))
+    path = write("part.usda", stage(square()))
     for name, value, match in (
         ("MAX_MESH_FACES", 1, "more than 1 faces"),
         ("MAX_MESH_PARTS", 0, "more than 0 parts"),
