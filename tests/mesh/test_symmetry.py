@@ -6,6 +6,7 @@ import trimesh
 from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.mesh.symmetry import _axes, feature_fractions
 from curvireg_torch.synthetic import example_mesh
+from tests._support import slow_after
 
 ROTATED = trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9]))
 BOTTLE = trimesh.creation.revolve(
@@ -20,20 +21,21 @@ def moved(mesh):
     return mesh
 
 
-BOXES = [
-    (trimesh.creation.box(size), count)
-    for size, count in (((1, 2, 3), 4), ((1, 1, 3), 8), ((1, 1, 1), 24))
+SHAPES = [
+    (trimesh.creation.box((1, 2, 3)), 4),
+    (trimesh.creation.box((1, 1, 3)), 8),
+    (trimesh.creation.box((1, 1, 1)), 24),
+    (trimesh.creation.cylinder(1.0, 3.0, sections=3), 6),
+    (moved(BOTTLE), 36),
+    (example_mesh(), 1),
+    (moved(trimesh.creation.box((1, 2, 3))), 4),
+    (trimesh.creation.cylinder(1.0, 3.0, sections=5), 10),
+    (trimesh.creation.cylinder(1.0, 3.0, sections=64), 72),
+    (BOTTLE, 36),
 ]
-PRISMS = [
-    (trimesh.creation.cylinder(1.0, 3.0, sections=n), count)
-    for n, count in ((3, 6), (5, 10), (64, 72))
-]
-MOVED = [(moved(BOTTLE), 36), (moved(trimesh.creation.box((1, 2, 3))), 4)]
 
 
-@pytest.mark.parametrize(
-    ("mesh", "count"), [*BOXES, *PRISMS, *MOVED, (BOTTLE, 36), (example_mesh(), 1)]
-)
+@pytest.mark.parametrize(("mesh", "count"), slow_after(6, SHAPES))
 def test_symmetries_map_the_shape_to_itself(mesh, count):
     symmetries = mesh_symmetries(mesh)
     assert symmetries.shape == (count, 4, 4)

@@ -32,7 +32,7 @@ def truck(*, with_cabin=True):
 @cache
 def bank(*, with_cabin=True, scale=1.0):
     mesh = truck(with_cabin=with_cabin).copy().apply_scale(scale)
-    views = sample_views(azimuth_step=15, elevations=[10, 30, 50])
+    views = sample_views(azimuth_step=30, elevations=[10, 30, 50])
     return ViewBank.build(mesh, views, image_size=96, progress=False)
 
 

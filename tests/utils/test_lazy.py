@@ -52,13 +52,17 @@ def test_help_imports_nothing_heavy(words):
     assert not imported_by(f"from curvireg_torch.cli import main; main({words.split()!r})") & HEAVY
 
 
-def test_imports_are_only_those_of_what_is_used():
+def test_errors_and_options_import_nothing_heavy():
     light = imported_by(
         "import curvireg_torch as cr, curvireg_torch.jobs.options; cr.CurviregError"
     )
     assert not light & HEAVY
-    # kornia takes 0.3 s, which the filters of photographs need; sympy takes a second, and torch
-    # imports it where it emulates an operation.
+
+
+@pytest.mark.slow
+def test_a_registration_imports_what_it_uses():
+    """kornia takes 0.3 s, which the filters of photographs need; sympy takes a second, and torch
+    imports it where it emulates an operation."""
     loaded = imported_by(
         "import numpy, trimesh, curvireg_torch as cr, curvireg_torch.jobs.result_files; "
         "from curvireg_torch.geometry import sample_views; "
