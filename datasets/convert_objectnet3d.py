@@ -19,8 +19,8 @@ from collections import Counter
 from pathlib import Path
 
 from curvireg_torch.data._base import is_plain_name
-from curvireg_torch.data.mat_files import read_mat
-from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.data.mat_files import MatStruct, read_mats
+from curvireg_torch.data.pascal3d import objects_of
 
 
 def place(source: Path, target: Path) -> None:
@@ -33,10 +33,8 @@ def place(source: Path, target: Path) -> None:
         shutil.copy2(source, target)
 
 
-def classes_of(annotation: Path) -> set[str]:
-    record = read_mat(annotation, "record")
-    objects = record[0].get("objects") if isinstance(record, list) and record else None
-    names = {entry.get("class") for entry in objects} if isinstance(objects, list) else set()
+def classes_of(objects: list[MatStruct]) -> set[str]:
+    names = {entry.get("class") for entry in objects if not isinstance(entry.get("class"), list)}
     return {name for name in names if isinstance(name, str) and is_plain_name(name)}
 
 
@@ -44,21 +42,23 @@ def convert_split(root: Path, out: Path, split: str) -> Counter[str]:
     """Convert one split; returns the numbers of placed images and of missing or corrupt files."""
     counts: Counter[str] = Counter()
     lists: dict[str, list[str]] = {}
+    found = []
     for image_id in (root / "Image_sets" / f"{split}.txt").read_text(encoding="utf-8").split():
         annotation = root / "Annotations" / f"{image_id}.mat"
         image = root / "Images" / f"{image_id}.JPEG"
         if not is_plain_name(image_id) or not annotation.is_file():
             counts["missing_annotation"] += 1
-            continue
-        if not image.is_file():
+        elif not image.is_file():
             counts["missing_image"] += 1
-            continue
-        try:
-            names = classes_of(annotation)
-        except InvalidInputError:
+        else:
+            found.append((image_id, annotation, image))
+    records = read_mats([annotation for _, annotation, _ in found], "record")
+    for (image_id, annotation, image), record in zip(found, records, strict=True):
+        objects = objects_of(record)
+        if objects is None:
             counts["corrupt_annotation"] += 1
             continue
-        for name in sorted(names):
+        for name in sorted(classes_of(objects)):
             place(annotation, out / "Annotations" / f"{name}_imagenet" / annotation.name)
             place(image, out / "Images" / f"{name}_imagenet" / image.name)
             lists.setdefault(name, []).append(image_id)

@@ -2,15 +2,14 @@
 ImageNet."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Unpack
-
-import numpy as np
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.aliases import PathName
 from ..utils.checks import check_option
+from ..utils.files import finite_numbers
 from ._base import (
     IMAGE_SUFFIXES,
     ObjectDataset,
@@ -20,7 +19,7 @@ from ._base import (
     is_plain_name,
     pose_fields,
 )
-from .mat_files import MatStruct, MatValue, read_mat
+from .mat_files import MatStruct, MatValue, read_mats
 
 _README = "datasets/pascal3d/README.md"
 _VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")
@@ -105,8 +104,7 @@ class Pascal3DPlus(ObjectDataset):
         for name in (split, *self.categories):
             if not is_plain_name(name):
                 raise InvalidInputError(f"split, categories: expected plain names, got {name!r}")
-        for category in self.categories:
-            self._index(category)
+        self._index()
 
     def _list_files(self, category: str) -> list[Path]:
         own = self.root / "Image_sets" / f"{category}_{self.part}_{self.split}.txt"
@@ -136,26 +134,31 @@ class Pascal3DPlus(ObjectDataset):
             f"no image list {names}; {_README} shows the layout", subject=self.root
         )
 
-    def _index(self, category: str) -> None:
-        folder = f"{category}_{self.part}"
-        for image_id in self._ids(category):
-            item = f"{folder}/{image_id}"
-            annotation = self.root / "Annotations" / folder / f"{image_id}.mat"
-            if not is_plain_name(image_id) or not annotation.is_file():
-                self._skip("missing_annotation", item)
-                continue
-            images = self.root / "Images" / folder
-            candidates = (
-                images / (image_id + suffix)
-                for suffix in (*IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES))
-            )
-            image = next((path for path in candidates if path.is_file()), None)
-            if image is None:
-                self._skip("missing_image", item)
-                continue
-            try:
-                objects = _objects(read_mat(annotation, "record"))
-            except InvalidInputError:
+    def _files(self) -> Iterator[tuple[str, str, Path, Path]]:
+        """Class, id, annotation and photograph of what the lists name."""
+        for category in self.categories:
+            folder = f"{category}_{self.part}"
+            for image_id in self._ids(category):
+                annotation = self.root / "Annotations" / folder / f"{image_id}.mat"
+                if not is_plain_name(image_id) or not annotation.is_file():
+                    self._skip("missing_annotation", f"{folder}/{image_id}")
+                    continue
+                stem = self.root / "Images" / folder / image_id
+                suffixes = (*IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES))
+                candidates = (stem.with_name(image_id + suffix) for suffix in suffixes)
+                image = next(filter(Path.is_file, candidates), None)
+                if image is None:
+                    self._skip("missing_image", f"{folder}/{image_id}")
+                    continue
+                yield category, image_id, annotation, image
+
+    def _index(self) -> None:
+        files = list(self._files())
+        records = read_mats([annotation for _, _, annotation, _ in files], "record")
+        for (category, image_id, _, image), record in zip(files, records, strict=True):
+            item = f"{category}_{self.part}/{image_id}"
+            objects = objects_of(record)
+            if objects is None:
                 self._skip("corrupt_annotation", item)
                 continue
             for index, entry in enumerate(objects):
@@ -174,10 +177,11 @@ class Pascal3DPlus(ObjectDataset):
         if box is None:
             return "bad_box"
         views = entry.get("viewpoint")
-        if not isinstance(views, list) or not views:
+        view = views[0] if isinstance(views, list) and views else None
+        if not isinstance(view, dict):
             return "no_viewpoint"
         azimuth, elevation, distance = (
-            _number(views[0].get(key)) for key in ("azimuth", "elevation", "distance")
+            _number(view.get(key)) for key in ("azimuth", "elevation", "distance")
         )
         if azimuth is None or elevation is None or not distance:
             return "coarse_viewpoint"
@@ -189,10 +193,10 @@ class Pascal3DPlus(ObjectDataset):
             return "missing_mesh"
         return {
             "box": box,
-            **pose_fields(azimuth, elevation, _number(views[0].get("theta")) or 0.0),
+            **pose_fields(azimuth, elevation, _number(view.get("theta")) or 0.0),
             "distance": distance,
             "translation": (0.0, 0.0, distance),
-            "camera_matrix": _camera(views[0], box, self.pixel_origin),
+            "camera_matrix": _camera(view, box, self.pixel_origin),
             "category": category,
             "cad_index": int(cad_index),
             "cad_path": str(cad),
@@ -200,26 +204,27 @@ class Pascal3DPlus(ObjectDataset):
         }
 
 
-def _objects(record: MatValue) -> list[MatStruct]:
-    objects = record[0].get("objects") if isinstance(record, list) and record else None
-    if isinstance(objects, np.ndarray) and objects.size == 0:
-        return []
+def objects_of(record: MatValue) -> list[MatStruct] | None:
+    """The annotated objects of a file's ``record``; None if it is no such record."""
+    first = record[0] if isinstance(record, list) and record else None
+    objects = first.get("objects") if isinstance(first, dict) else None
     if not isinstance(objects, list):
-        raise InvalidInputError("record: holds no struct array 'objects'")
-    return objects
+        return None
+    structs = [entry for entry in objects if isinstance(entry, dict)]
+    return structs if len(structs) == len(objects) else None
 
 
 def _number(value: MatValue) -> float | None:
     """The first number of ``value`` if it is finite, else None."""
-    if not isinstance(value, np.ndarray) or value.size == 0 or not math.isfinite(value[0]):
-        return None
-    return float(value[0])
+    first = value[0] if isinstance(value, list) and value else None
+    return first if isinstance(first, float) and math.isfinite(first) else None
 
 
 def _box(value: MatValue, origin: int) -> tuple[float, ...] | None:
-    if not isinstance(value, np.ndarray) or value.size != 4 or not np.isfinite(value).all():
+    numbers = finite_numbers(value, 4)
+    if numbers is None:
         return None
-    x0, y0, x1, y1 = (float(v) - origin for v in value)
+    x0, y0, x1, y1 = (v - origin for v in numbers)
     return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
 
 

@@ -7,7 +7,6 @@ What an earlier run left goes before the work begins, but for the rows that are 
 fails leaves no result of another photograph.
 """
 
-import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -18,6 +17,7 @@ from typing import Any
 from ..errors import InvalidInputError, OutputError
 from ..formats.exports import ros, trackers
 from ..utils.files import check_writable, read_json, write_file
+from .store import to_json
 
 try:
     import fcntl
@@ -40,7 +40,10 @@ FILES: dict[str, tuple[str, ...]] = {
 }
 """Names, or patterns of names, that each command may write into the folder of its results."""
 
-ELSEWHERE = "choose another folder"
+
+def _refused(path: Path, text: str) -> InvalidInputError:
+    """The error about a file in the way, whose ``text`` ends before the advice."""
+    return InvalidInputError(f"{text}choose another folder", subject=path, kind="out")
 
 
 @contextmanager
@@ -110,10 +113,8 @@ def _locked(folder: Path) -> Iterator[None]:
             try:
                 fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise InvalidInputError(
-                    f"{folder}: another run is writing its results here; wait for it, or "
-                    f"{ELSEWHERE}",
-                    kind="out",
+                raise _refused(
+                    folder, "another run is writing its results here; wait for it, or "
                 ) from None
             except OSError:  # some network file systems lock no folders
                 pass
@@ -129,15 +130,9 @@ def _check_source(
     if not (lost and source):
         return
     if in_the_way:
-        raise InvalidInputError(
-            f"{in_the_way[0]}: holds results of {lost[0]}, which would be lost; {ELSEWHERE}",
-            kind="out",
-        )
+        raise _refused(in_the_way[0], f"holds results of {lost[0]}, which would be lost; ")
     if before["files"]:
-        raise InvalidInputError(
-            f"{folder}: a run of {lost[0]} was stopped here; {ELSEWHERE}, or remove {MARKER} in it",
-            kind="out",
-        )
+        raise _refused(folder, f"a run of {lost[0]} was stopped here; remove {MARKER} in it, or ")
 
 
 def check_output_file(path: Path, inputs: Iterable[Path], *, mark: bytes) -> None:
@@ -149,9 +144,7 @@ def check_output_file(path: Path, inputs: Iterable[Path], *, mark: bytes) -> Non
     if path.exists():
         _check_inputs([path], inputs)
         if not path.is_file() or mark not in path.read_bytes():
-            raise InvalidInputError(
-                f"{path}: exists, and this command did not write it; {ELSEWHERE}", kind="out"
-            )
+            raise _refused(path, "exists, and this command did not write it; ")
     check_writable(path.parent)
 
 
@@ -170,10 +163,7 @@ def _check_inputs(outputs: Sequence[Path], inputs: Iterable[Path]) -> None:
         return
     for path in inputs:
         if path.exists() and _identity(path) in identities:
-            raise InvalidInputError(
-                f"{path}: an input of this command, which would overwrite it; {ELSEWHERE}",
-                kind="out",
-            )
+            raise _refused(path, "an input of this command, which would overwrite it; ")
 
 
 def _identity(path: Path) -> object:
@@ -191,15 +181,10 @@ def _check_owner(path: Path, command: str, written: Mapping[str, Any]) -> None:
         for name, run in written.items()
         if any(fnmatch(path.name, pattern) for pattern in run["files"])
     ]
-    if command in owners:
-        return
-    if owners:
-        raise InvalidInputError(
-            f"{path}: a result of 'curvireg {owners[0]}'; {ELSEWHERE}", kind="out"
-        )
-    raise InvalidInputError(
-        f"{path}: not written by this command; move it away, or {ELSEWHERE}", kind="out"
-    )
+    if not owners:
+        raise _refused(path, "not written by this command; move it away, or ")
+    if command not in owners:
+        raise _refused(path, f"a result of 'curvireg {owners[0]}'; ")
 
 
 def _read(folder: Path) -> dict[str, Any]:
@@ -210,7 +195,7 @@ def _read(folder: Path) -> dict[str, Any]:
     content = read_json(path, dict, "docs/results.md")
     runs = content.get("commands")
     if not isinstance(runs, dict) or not all(map(_is_run, runs.values())):
-        raise InvalidInputError(f"{path}: not of this program; {ELSEWHERE}", kind="out")
+        raise _refused(path, "not of this program; ")
     return runs
 
 
@@ -226,11 +211,10 @@ def _is_run(run: object) -> bool:
 def _mark(folder: Path, command: str, files: Sequence[str], source: Sequence[str]) -> None:
     """Note that ``command`` wrote ``files``, or is about to; they are no other command's."""
     before = _read(folder)
-    runs = {}
-    for name, run in before.items():
-        runs[name] = {**run, "files": [file for file in run["files"] if file not in files]}
+    runs = {
+        name: {**run, "files": [file for file in run["files"] if file not in files]}
+        for name, run in before.items()
+    }
     runs[command] = {"files": list(files), "source": list(source)}
     if runs != before:
-        write_file(
-            folder / MARKER, (json.dumps({"schema": 1, "commands": runs}, indent=2) + "\n").encode()
-        )
+        write_file(folder / MARKER, to_json({"schema": 1, "commands": runs}).encode())

@@ -103,11 +103,6 @@ def listed(names: Iterable[object], most: int = 8) -> str:
     return ", ".join(texts)
 
 
-def _is_pattern(path: Path) -> bool:
-    """Whether a path is a pattern of several, such as ``shots/*.jpg``."""
-    return bool(pattern_of(path))
-
-
 def pattern_of(path: Path) -> str:
     """The pattern of :func:`glob.glob` for a path with wildcards beyond the folders that exist;
     "" without any, as of a file in a folder called ``part [1]``.
@@ -126,7 +121,7 @@ def pattern_of(path: Path) -> str:
 def is_one_photograph(paths: Sequence[Path]) -> bool:
     """Whether the paths are a single file that is not a video."""
     return len(paths) == 1 and not (
-        _is_pattern(paths[0]) or paths[0].is_dir() or paths[0].suffix.lower() in VIDEOS
+        pattern_of(paths[0]) or paths[0].is_dir() or paths[0].suffix.lower() in VIDEOS
     )
 
 
@@ -144,28 +139,23 @@ def check_given(
 
     Of several photographs, those that are missing are reported later, each by itself.
     """
-    for path, kind in [
-        *((photo, "a photograph") for photo in photos),
-        *([(listed, "a list")] if listed else []),
-    ]:
+    lists = [listed] if listed else []
+    swapped = [mesh for mesh in meshes if mesh.suffix.lower() not in MESHES_AND_BANKS]
+    for path in (*photos, *lists):
+        kind = "a list" if path in lists else "a photograph"
         if path.suffix.lower() in MESHES_AND_BANKS:
-            other = next(
-                (str(mesh) for mesh in meshes if mesh.suffix.lower() not in MESHES_AND_BANKS), ""
-            )
-            advice = (
-                f"it and {other} seem to be swapped: {_ORDER}"
-                if other
-                else f"{_ORDER}, several by --mesh each"
-            )
+            advice = f"{_ORDER}, several by --mesh each"
+            if swapped:
+                advice = f"it and {swapped[0]} seem to be swapped: {_ORDER}"
             raise InvalidInputError(f"a mesh where {kind} is expected; {advice}", subject=path)
-        if kind == "a photograph" and path.suffix.lower() == ".csv":
+        if path not in lists and path.suffix.lower() == ".csv":
             raise InvalidInputError(
                 f"a list where a photograph is expected; give it as --list {path}", subject=path
             )
     for mesh in meshes:
         if mesh.suffix == ".safetensors" and not banks:
             raise InvalidInputError("a bank where a mesh is expected", subject=mesh)
-        is_picture = _is_pattern(mesh) or mesh.suffix.lower() in (*IMAGES, *VIDEOS)
+        is_picture = bool(pattern_of(mesh)) or mesh.suffix.lower() in (*IMAGES, *VIDEOS)
         if mesh.is_dir() or is_picture:
             kind = "a photograph" if is_picture else "a folder"
             raise InvalidInputError(
