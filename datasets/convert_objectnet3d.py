@@ -19,8 +19,7 @@ from collections import Counter
 from pathlib import Path
 
 from curvireg_torch.data._base import is_plain_name
-from curvireg_torch.data.mat_files import MatStruct, read_mats
-from curvireg_torch.data.pascal3d import objects_of
+from curvireg_torch.data.mat_files import MatStruct, objects_of, read_mats
 
 
 def place(source: Path, target: Path) -> None:

@@ -22,6 +22,7 @@ from .options import (
     add_command,
     add_limits,
     add_options,
+    add_path,
     add_workers,
     input_files,
     register_options,
@@ -55,10 +56,8 @@ def _add_bank(commands: Any) -> None:
         help="render and describe the views of MESH",
         run=_build_bank,
     )
-    parser.add_argument("mesh", type=Path, metavar="MESH")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help="the bank, as .safetensors"
-    )
+    add_path(parser, "mesh", "MESH")
+    add_path(parser, "--out", "FILE", required=True, help="the bank, as .safetensors")
     add_options(parser, *MESH, *METHOD)
 
 
@@ -160,11 +159,11 @@ def _add_evaluate(commands: Any) -> None:
             metavar="N",
             help="only N objects, spread evenly over the set",
         )
-        add(
+        add_path(
+            dataset,
             "--out",
-            type=Path,
+            "DIR",
             required=True,
-            metavar="DIR",
             help="folder of the results; made if it does not exist",
         )
 
@@ -227,14 +226,8 @@ def _add_view(commands: Any) -> None:
         description="Opens a page on this machine; needs the extra [viewer].",
         run=view,
     )
-    parser.add_argument("photo", type=Path, nargs="?", metavar="PHOTO")
-    parser.add_argument(
-        "mesh",
-        type=Path,
-        nargs="?",
-        metavar="MESH",
-        help="a mesh or a bank; both can be added later",
-    )
+    add_path(parser, "photo", "PHOTO", nargs="?")
+    add_path(parser, "mesh", "MESH", nargs="?", help="a mesh or a bank; both can be added later")
     options = [name for name in PHOTOGRAPH if name != "mask"]
     add_options(parser, *options, *BOXES, box="in px; can be drawn")
     add_limits(parser)
@@ -274,13 +267,11 @@ def _add_plot(commands: Any) -> None:
     for (kind, text), example in zip(PICTURES.items(), examples, strict=True):
         parser = add_command(kinds, kind, example, help=text, run=draw)
         parser.set_defaults(kind=kind)
-        parser.add_argument("photo", type=Path, metavar="PHOTO")
-        parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
+        add_path(parser, "photo", "PHOTO")
+        add_path(parser, "mesh", "MESH", help="a mesh or a bank")
         add_options(parser, *PHOTOGRAPH)
         add_limits(parser)
-        parser.add_argument(
-            "--out", type=Path, required=True, metavar="FILE", help=", ".join(FORMATS)
-        )
+        add_path(parser, "--out", "FILE", required=True, help=", ".join(FORMATS))
 
 
 def draw(arguments: argparse.Namespace) -> None:
@@ -330,9 +321,7 @@ def _add_demo(commands: Any) -> None:
     parser = add_command(commands, "demo", *examples, help=text, run=demo)
     parser.set_defaults(pose="upright")
     parser.add_argument("--seed", type=int, default=2, help="number of the scene (default: 2)")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder of the results"
-    )
+    add_path(parser, "--out", "DIR", required=True, help="folder of the results")
     add_options(parser, *METHOD)
 
 

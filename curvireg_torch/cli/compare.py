@@ -1,10 +1,10 @@
 """``curvireg compare RUN_A RUN_B``."""
 
 import argparse
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
-from .options import add_command
+from .options import add_command, add_path
 
 
 def add_compare(commands: Any) -> None:
@@ -20,17 +20,21 @@ def add_compare(commands: Any) -> None:
         "only do not count.",
         run=_compare_runs,
     )
-    parser.add_argument("a", type=Path, metavar="RUN_A", help="folder of 'curvireg evaluate --out'")
-    parser.add_argument("b", type=Path, metavar="RUN_B", help="another one, of the same dataset")
+    add_path(parser, "a", "RUN_A", help="folder of 'curvireg evaluate --out'")
+    add_path(parser, "b", "RUN_B", help="another one, of the same dataset")
     parser.add_argument("--json", action="store_true", help="print the comparison as JSON")
 
 
 def _compare_runs(arguments: argparse.Namespace) -> None:
     """Compare two evaluations."""
-    from ..evaluation.compare import compare, in_words, read_run, to_document
+    from ..evaluation.compare import compare, in_words, read_run
+    from ..jobs.store import to_json
 
     first = read_run(arguments.a)
     second = read_run(arguments.b)
     comparisons = compare(first, second)
-    show = to_document if arguments.json else in_words
-    print(show(first, second, comparisons), end="")
+    if not arguments.json:
+        print(in_words(first, second, comparisons), end="")
+        return
+    scores = [asdict(each) for each in comparisons]
+    print(to_json({"a": first.name, "b": second.name, "comparisons": scores}), end="")

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,6 +26,7 @@ from .options import (
     add_command,
     add_limits,
     add_options,
+    add_path,
     input_files,
     register_options,
 )
@@ -70,7 +71,7 @@ def add_follow(commands: Any) -> None:
     parser.add_argument(
         "frames", metavar="FRAMES", help=frames + "rtsp://... Live frames are dropped, not delayed"
     )
-    parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
+    add_path(parser, "mesh", "MESH", help="a mesh or a bank")
     options = [name for name in PHOTOGRAPH if name != "mask"]
     add_options(
         parser,
@@ -90,7 +91,7 @@ def add_follow(commands: Any) -> None:
     parser.add_argument(
         "--show", action="store_true", help="open a page with the latest frame; --out is optional"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
+    add_path(parser, "--out", "DIR", help="folder of the results")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -222,16 +223,16 @@ def _follow(
     columns = ["photo", "verdict", *POSE_COLUMNS, *SCORES]
     table = None if out is None else CsvFile(out / "results.csv", columns)
     start = time.monotonic()
-    video = None
-    page = None
+    sinks: list[Callable[[Tensor | None, Registration | FailedRegistration], object]] = []
     try:
         with ExitStack() as stack:
             if out is not None:
-                video = stack.enter_context(OverlayVideo(out / "overlay.mp4", registrar, fps=fps))
+                video = OverlayVideo(out / "overlay.mp4", registrar, fps=fps)
+                sinks.append(stack.enter_context(video).add)
             if show:
                 from ..viewer.live import LivePage
 
-                page = stack.enter_context(LivePage(registrar))
+                sinks.append(stack.enter_context(LivePage(registrar)).show)
             bar = tqdm(
                 frames,
                 desc="follow",
@@ -253,10 +254,8 @@ def _follow(
                 tally.camera = tally.camera or _camera_in_words(result)
                 if as_json:
                     print(json.dumps(pose, allow_nan=False), flush=True)
-                if video is not None:
-                    video.add(shown, result)
-                if page is not None:
-                    page.show(shown, result)
+                for sink in sinks:
+                    sink(shown, result)
     except KeyboardInterrupt:
         if not live:  # a file has an end
             raise

@@ -2,14 +2,13 @@
 
 import argparse
 import json
-from pathlib import Path
 from typing import Any
 
 from ..jobs.options import whole_number
 from ..utils.choices import check_given
 from ..utils.files import write_file
 from .libraries import load_libraries
-from .options import MESH, METHOD, add_command, add_options, input_files, register_options
+from .options import MESH, METHOD, add_command, add_options, add_path, input_files, register_options
 from .stages import shown_stages
 
 
@@ -25,10 +24,8 @@ def add_inspect(commands: Any) -> None:
         "the mesh.",
         run=_run_inspect,
     )
-    parser.add_argument("mesh", type=Path, metavar="MESH")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder of the report"
-    )
+    add_path(parser, "mesh", "MESH")
+    add_path(parser, "--out", "DIR", required=True, help="folder of the report")
     add = parser.add_argument
     add(
         "--n",
@@ -44,11 +41,8 @@ def add_inspect(commands: Any) -> None:
         action="store_false",
         help="as if the camera were unknown",
     )
-    add(
-        "--photo",
-        type=Path,
-        metavar="DIR",
-        help="your own photographs without the object, as backgrounds",
+    add_path(
+        parser, "--photo", "DIR", help="your own photographs without the object, as backgrounds"
     )
     add(
         "--clutter",

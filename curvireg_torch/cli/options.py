@@ -54,6 +54,11 @@ def add_command(commands: Any, name: str, *examples: str, **how: Any) -> Any:
     return parser
 
 
+def add_path(parser: Any, name: str, metavar: str, **how: Any) -> None:
+    """Add an argument that is a path."""
+    parser.add_argument(name, type=Path, metavar=metavar, **how)
+
+
 def add_options(parser: Any, *names: str, **help_texts: str) -> None:
     """Add options of a registration; ``help_texts`` replace those of their declarations."""
     for name in names:

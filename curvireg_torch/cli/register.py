@@ -23,6 +23,7 @@ from .options import (
     add_command,
     add_limits,
     add_options,
+    add_path,
     add_workers,
     conflict,
     given_options,
@@ -74,31 +75,31 @@ def add_register(commands: Any) -> None:
         run=run,
     )
     add = parser.add_argument
-    add(
+    add_path(
+        parser,
         "paths",
-        type=Path,
+        "PHOTO... MESH",
         nargs="*",
-        metavar="PHOTO... MESH",
         help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj "
         ".ply .stl .off .glb .gltf .3mf .urdf; with extras .step .iges .dae .usdz) or a bank. "
         "Textures and colours are compared too; a mesh without colours is grey",
     )
     candidates = "a candidate mesh; repeat the option, and the best of them is reported"
-    add("--mesh", type=Path, action="append", default=[], metavar="MESH", help=candidates)
-    add(
+    add_path(parser, "--mesh", "MESH", action="append", default=[], help=candidates)
+    add_path(
+        parser,
         "--list",
-        type=Path,
-        metavar="LIST",
+        "LIST",
         help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and "
         "azimuth,side,... (see below: what "
         "is known about the pose). Paths are relative to the list's folder. Empty cells mean: "
         "detect the object, "
         "EXIF or an estimated camera, MESH, what the options say",
     )
-    add(
+    add_path(
+        parser,
         "--views",
-        type=Path,
-        metavar="RIG",
+        "RIG",
         help="photographs of one pose from cameras with known poses: CSV with columns "
         "photo,x0,y0,x1,y1 (box may be "
         "empty), fx,fy,cx,cy or camera (a file), r11..r33 or qw,qx,qy,qz and tx,ty,tz (camera "
@@ -147,7 +148,7 @@ def add_register(commands: Any) -> None:
     frame = f"with --format ros: the camera's frame (default: {OPTICAL_FRAME})"
     add("--frame", metavar="NAME", help=frame)
     add("--json", action="store_true", help="print only the results as JSON; --out is optional")
-    add("--out", type=Path, metavar="DIR", help="folder of the results; made if it does not exist")
+    add_path(parser, "--out", "DIR", help="folder of the results; made if it does not exist")
 
 
 NO_CAMERA = f"needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"

@@ -139,15 +139,15 @@ class BOPDataset(ObjectDataset):
         scene = f"{self.split}/{folder.name}"
         contents: list[Fields] = []
         for name in ("scene_gt.json", "scene_camera.json", "scene_gt_info.json"):
+            content = {}
             try:
                 content = read_json(folder / name, dict, _README)
-                contents.append({without_zeros(key): value for key, value in content.items()})
             except MissingFileError:
                 if name != "scene_gt_info.json":
                     return self._skip("missing_annotation", f"{scene}/{name}")
-                contents.append({})
             except InvalidInputError:
                 return self._skip("corrupt_annotation", f"{scene}/{name}")
+            contents.append({without_zeros(key): value for key, value in content.items()})
         ground_truth, cameras, infos = contents
         images = _images_by_number(folder)
         for key in sorted(ground_truth, key=lambda k: int(k) if k.isdecimal() else -1):
@@ -156,23 +156,21 @@ class BOPDataset(ObjectDataset):
             if not key.isdecimal() or not isinstance(instances, list):
                 self._skip("corrupt_annotation", item)
                 continue
-            image = images.get(int(key))
             samples: list[Sample] = []
             for index, entry in enumerate(instances):
                 parsed = self._parse(entry, entry_at(infos.get(key), index), cameras.get(key))
                 if isinstance(parsed, str):
                     self._skip(parsed, f"{item} #{index}")
                 else:
-                    ids = {"image_id": int(key), "instance_index": index, "image_path": str(image)}
-                    samples.append({**parsed, "scene_id": int(folder.name), **ids})
-            for sample in _mark_targets(samples, counts):
-                item_name = f"{item} #{sample['instance_index']}"
-                if sample.pop("no_target"):
-                    self._skip("no_target", item_name)
-                elif image is None:
-                    self._skip("missing_image", item_name)
-                else:
-                    self._items.append(sample)
+                    ids = {"scene_id": int(folder.name), "image_id": int(key)}
+                    samples.append({**parsed, **ids, "instance_index": index})
+            image = images.get(int(key))
+            left_out = _no_targets(samples, counts)
+            for sample in samples:
+                index = sample["instance_index"]
+                reason = "no_target" if index in left_out else "missing_image"
+                kept = reason if reason == "no_target" or image is None else sample
+                self._add(kept, f"{item} #{index}", image_path=str(image))
         return None
 
     def _parse(self, entry: object, info: Fields, camera: object) -> Sample | str:
@@ -314,16 +312,23 @@ def _targets(path: Path) -> Counts:
     return counts
 
 
-def _mark_targets(samples: list[Sample], counts: Counts | None) -> list[Sample]:
-    """Set ``no_target`` of the samples of one image, and remove its targets from ``counts``."""
+def _no_targets(samples: list[Sample], counts: Counts | None) -> set[int]:
+    """The ``instance_index`` of samples of one image that are no targets; removes its targets from
+    ``counts``."""
+    if counts is None:
+        return set()
     keys = [(s["scene_id"], s["image_id"], s["obj_id"]) for s in samples]
-    remaining = {key: math.inf if counts is None else counts.pop(key, 0) for key in set(keys)}
-    visibility = [-1.0 if math.isnan(s["visib_fract"]) else s["visib_fract"] for s in samples]
+    remaining = {key: counts.pop(key, 0) for key in set(keys)}
+    left_out = set()
     # stable: ties keep their order
-    for i in sorted(range(len(samples)), key=lambda i: -visibility[i]):
-        samples[i]["no_target"] = remaining[keys[i]] <= 0
-        remaining[keys[i]] -= 1
-    return samples
+    for sample, key in sorted(
+        zip(samples, keys, strict=True),
+        key=lambda pair: 1.0 if math.isnan(pair[0]["visib_fract"]) else -pair[0]["visib_fract"],
+    ):
+        if remaining[key] <= 0:
+            left_out.add(sample["instance_index"])
+        remaining[key] -= 1
+    return left_out
 
 
 def entry_at(infos: object, index: int) -> Fields:

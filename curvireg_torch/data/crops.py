@@ -24,22 +24,52 @@ _RANGE = (360.0, 180.0, 360.0)
 
 
 class ObjectCrops(Dataset[dict[str, Tensor]]):
-    """Square crops of the annotated objects of a dataset, see :func:`crops`.
+    """The annotated objects of a dataset as square crops with training targets, for
+    ``torch.utils.data.DataLoader``.
+
+    Args:
+        dataset: a dataset of this module; its ``transform`` is applied before cropping. To split
+            it, take a ``torch.utils.data.Subset`` of the result.
+        size: side of the crops in px.
+        margin: around the box, as a fraction of its longer side.
+        bins: number of equal bins of azimuth in [0, 360), elevation in [-90, 90] and theta in
+            [-180, 180) degrees.
+        transform: function of each crop (3, size, size), for instance an augmentation of colours.
 
     Attributes:
         dataset: the dataset that is cropped.
         classes: names of the classes, in the order of ``class_id``.
         bins: number of bins of azimuth, elevation and theta.
+
+    Samples are dictionaries:
+        - ``image`` (3, size, size) float32 in [0, 1]
+        - ``rotation`` (3, 3) float32 model to OpenCV camera as annotated, NaN if unknown
+        - ``viewpoint_bins`` (3,) int64, the bins of azimuth, elevation and theta from 0; -100 if
+          unknown
+        - ``class_id`` () int64, index of ``classes``: categories, or the object's numbers of a BOP
+          set
+
+    Objects without a box (``unknown_box``) and those of which nothing is visible
+    (``invisible``) are left out and counted in ``skipped``.
+
+    Raises:
+        InvalidInputError: another kind of dataset, or an option is out of range.
+
+    Example:
+        >>> from torch.utils.data import DataLoader
+        >>> cars = crops(Pascal3DPlus("data/PASCAL3D+_release1.1"), 128)  # doctest: +SKIP
+        >>> next(iter(DataLoader(cars, batch_size=8)))["image"].shape  # doctest: +SKIP
+        torch.Size([8, 3, 128, 128])
     """
 
     def __init__(
         self,
         dataset: ObjectDataset,
-        size: int,
+        size: int = 128,
         *,
-        margin: float,
-        bins: Sequence[int],
-        transform: Callable[[Tensor], Tensor] | None,
+        margin: float = 0.1,
+        bins: Sequence[int] = (24, 12, 24),
+        transform: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         if not isinstance(dataset, ObjectDataset):
             raise InvalidInputError(
@@ -105,49 +135,7 @@ class ObjectCrops(Dataset[dict[str, Tensor]]):
         }
 
 
-def crops(
-    dataset: ObjectDataset,
-    size: int = 128,
-    *,
-    margin: float = 0.1,
-    bins: Sequence[int] = (24, 12, 24),
-    transform: Callable[[Tensor], Tensor] | None = None,
-) -> ObjectCrops:
-    """The annotated objects of a dataset as square crops with training targets, for
-    ``torch.utils.data.DataLoader``.
-
-    Args:
-        dataset: a dataset of this module; its ``transform`` is applied before cropping. To split
-            it, take a ``torch.utils.data.Subset`` of the result.
-        size: side of the crops in px.
-        margin: around the box, as a fraction of its longer side.
-        bins: number of equal bins of azimuth in [0, 360), elevation in [-90, 90] and theta in
-            [-180, 180) degrees.
-        transform: function of each crop (3, size, size), for instance an augmentation of colours.
-
-    Returns:
-        A dataset whose samples are dictionaries:
-
-        - ``image`` (3, size, size) float32 in [0, 1]
-        - ``rotation`` (3, 3) float32 model to OpenCV camera as annotated, NaN if unknown
-        - ``viewpoint_bins`` (3,) int64, the bins of azimuth, elevation and theta from 0; -100 if
-          unknown
-        - ``class_id`` () int64, index of ``classes``: categories, or the object's numbers of a BOP
-          set
-
-        Objects without a box (``unknown_box``) and those of which nothing is visible
-        (``invisible``) are left out and counted in ``skipped``.
-
-    Raises:
-        InvalidInputError: another kind of dataset, or an option is out of range.
-
-    Example:
-        >>> from torch.utils.data import DataLoader
-        >>> cars = crops(Pascal3DPlus("data/PASCAL3D+_release1.1"), 128)  # doctest: +SKIP
-        >>> next(iter(DataLoader(cars, batch_size=8)))["image"].shape  # doctest: +SKIP
-        torch.Size([8, 3, 128, 128])
-    """
-    return ObjectCrops(dataset, size, margin=margin, bins=bins, transform=transform)
+crops = ObjectCrops
 
 
 def viewpoint_bins(rotation: Tensor, bins: Sequence[int]) -> Tensor:

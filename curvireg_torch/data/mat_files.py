@@ -44,3 +44,13 @@ def read_mats(paths: Sequence[Path], variable: str) -> Iterator[MatValue]:
                 values.append(None)
             yield from values
             del names[: len(values)]
+
+
+def objects_of(record: MatValue) -> list[MatStruct] | None:
+    """The annotated objects of a file's ``record``; None if it is no such record."""
+    first = record[0] if isinstance(record, list) and record else None
+    objects = first.get("objects") if isinstance(first, dict) else None
+    if not isinstance(objects, list):
+        return None
+    structs = [entry for entry in objects if isinstance(entry, dict)]
+    return structs if len(structs) == len(objects) else None

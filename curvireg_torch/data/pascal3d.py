@@ -19,7 +19,7 @@ from ._base import (
     is_plain_name,
     pose_fields,
 )
-from .mat_files import MatStruct, MatValue, read_mats
+from .mat_files import MatStruct, MatValue, objects_of, read_mats
 
 _README = "datasets/pascal3d/README.md"
 _VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")
@@ -202,16 +202,6 @@ class Pascal3DPlus(ObjectDataset):
             "cad_path": str(cad),
             **flags,
         }
-
-
-def objects_of(record: MatValue) -> list[MatStruct] | None:
-    """The annotated objects of a file's ``record``; None if it is no such record."""
-    first = record[0] if isinstance(record, list) and record else None
-    objects = first.get("objects") if isinstance(first, dict) else None
-    if not isinstance(objects, list):
-        return None
-    structs = [entry for entry in objects if isinstance(entry, dict)]
-    return structs if len(structs) == len(objects) else None
 
 
 def _number(value: MatValue) -> float | None:

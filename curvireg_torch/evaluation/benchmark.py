@@ -154,24 +154,25 @@ class Benchmark(ABC):
     def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
         """Scores of the results ``rows``, none of them skipped: of all, of subsets, and of each
         group."""
-        numbers, (name, key), groups = (
-            range(len(rows)),
-            self.groups,
-            defaultdict[Any, list[int]](list),
-        )
-        for i, sample in enumerate(samples):
-            groups[sample[key]].append(i)
+        everything = list(range(len(rows)))
         subsets = {
-            subset: self.scores(rows, errors, [i for i in numbers if members[i]])
+            subset: self.scores(rows, errors, [i for i in everything if members[i]])
             for subset, members in self.subsets(samples).items()
         }
         return {
-            **self.scores(rows, errors, list(numbers)),
+            **self.scores(rows, errors, everything),
             **({"subsets": subsets} if subsets else {}),
-            name: {
-                str(group): self.scores(rows, errors, groups[group]) for group in sorted(groups)
-            },
+            self.groups[0]: self.scores_of_groups(samples, rows, errors, everything),
         }
+
+    def scores_of_groups(
+        self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors, chosen: Sequence[int]
+    ) -> Row:
+        """Scores of each group of the chosen results."""
+        groups = defaultdict[Any, list[int]](list)
+        for i in chosen:
+            groups[samples[i][self.groups[1]]].append(i)
+        return {str(group): self.scores(rows, errors, groups[group]) for group in sorted(groups)}
 
     def rotation_scores(self, errors: Tensor) -> Row:
         """``n``, an accuracy for each threshold, and ``med_err_deg``, of errors (N,) in degrees."""
@@ -196,14 +197,12 @@ class Benchmark(ABC):
                 "seconds": row["seconds"]["register"],
                 "failed": row["message"],
             }
-            line |= {
-                f"true_{name}": float(v) for name, v in zip(names, sample["viewpoint"], strict=True)
-            }
+            line |= zip(
+                [f"true_{name}" for name in names], sample["viewpoint"].tolist(), strict=True
+            )
             line |= {name: float(values[i]) for name, values in errors.items()}
             if "rotation" in row:
-                line |= {
-                    n: float(v) for n, v in zip(names, viewpoint_from_rotation(R[i]), strict=True)
-                }
+                line |= zip(names, map(float, viewpoint_from_rotation(R[i])), strict=True)
                 line["mesh"] = Path(row["mesh"]).name
             lines.append([_cell(line.get(name, "")) for name in self.columns])
         write_csv(path, lines)

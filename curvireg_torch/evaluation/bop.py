@@ -212,12 +212,10 @@ def same_instances(samples: Sequence[Row]) -> list[list[int]]:
         if bool(place.isnan().any()):
             kind = (*kind, sample["instance_index"] if kind in repeated else -1)
         reach = SAME_PLACE * sample["model_info"]["diameter"]
-        # or NaN
-        near = [
-            group for group in groups[kind] if not float((place - places[group[0]]).norm()) > reach
-        ]
-        if near:
-            near[0].append(i)
+        for group in groups[kind]:
+            if not float((place - places[group[0]]).norm()) > reach:  # or NaN
+                group.append(i)
+                break
         else:
             groups[kind].append([i])
     return [group for found in groups.values() for group in found]

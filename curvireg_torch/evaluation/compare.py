@@ -1,8 +1,9 @@
 """Two evaluations of one dataset, compared object by object."""
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -114,19 +115,19 @@ def compare(a: Run, b: Run) -> list[Comparison]:
     comparisons = []
     measures = DATASETS[a.dataset].scored.measures
     for score, (error, thresholds) in measures.items():
-        pair = _paired(a, b, keys, error)
-        successes = [
-            np.mean([errors < threshold for threshold in thresholds], axis=0) for errors in pair
-        ]
+        first, second = (
+            np.mean([errors < threshold for threshold in thresholds], axis=0)
+            for errors in _paired(a, b, keys, error)
+        )
         comparisons.append(
-            _compared(score, successes[0], successes[1], np.mean, is_fraction=len(thresholds) == 1)
+            _compared(score, first, second, np.mean, is_fraction=len(thresholds) == 1)
         )
     medians = dict.fromkeys(
         error for error, _ in measures.values() if error in ("error_deg", "rotation")
     )
     for error in medians:
-        first, second = _paired(a, b, keys, error)
-        comparisons.append(_compared("med_err_deg", first, second, np.median, lower_is_better=True))
+        pair = _paired(a, b, keys, error)
+        comparisons.append(_compared("med_err_deg", *pair, np.median, lower_is_better=True))
     return comparisons
 
 
@@ -164,8 +165,8 @@ def _compared(
         )
     chosen = np.random.default_rng(SEED).integers(0, len(a), (RESAMPLES, len(a)))
     with np.errstate(invalid="ignore"):  # a miss has an infinite error, and a median may be one
-        first = np.array([summarise(a[some]) for some in chosen])
-        second = np.array([summarise(b[some]) for some in chosen])
+        first = summarise(a[chosen], axis=1)
+        second = summarise(b[chosen], axis=1)
         value_a = float(summarise(a))
         value_b = float(summarise(b))
         difference = value_b - value_a
@@ -217,37 +218,24 @@ def in_words(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
         signs = f"B wins {each.wins}, loses {each.losses}, p {each.p:.2g}"
         lines.append(f"{each.score}: {values}   B - A {difference}   {signs}")
     names = [each.score for each in comparisons]
-    lines += [
-        "",
-        "Markdown:",
-        _markdown("run", "N", names),
-        _markdown("---", "---", ["---"] * len(names)),
-    ]
-    lines += [_markdown(*row) for row in _rows(a, b, comparisons)]
-    lines += ["", "LaTeX:", _latex("run", "N", names)]
-    lines += [_latex(*row) for row in _rows(a, b, comparisons)]
+    header = ["run", "N", *names]
+    rows = _rows(a, b, comparisons)
+    table = [header, ["---"] * len(header), *rows]
+    lines += ["", "Markdown:", *(f"| {' | '.join(row)} |" for row in table)]
+    lines += ["", "LaTeX:", *map(_latex, [header, *rows])]
     return "\n".join(lines) + "\n"
-
-
-def to_document(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
-    """The comparison as JSON."""
-    from ..jobs.store import to_json
-
-    return to_json(
-        {"a": a.name, "b": b.name, "comparisons": [asdict(each) for each in comparisons]}
-    )
 
 
 def _how(run: Run) -> str:
     return f"preset {run.settings.get('preset')}, {run.settings.get('protocol')}"
 
 
-def _rows(a: Run, b: Run, comparisons: Sequence[Comparison]) -> list[tuple[str, str, list[str]]]:
+def _rows(a: Run, b: Run, comparisons: Sequence[Comparison]) -> list[list[str]]:
     """Of each run its name, number of objects, and scores with intervals."""
     count = str(max(each.n for each in comparisons))
     first = [_value(each.a, each.a_interval, _digits(each)) for each in comparisons]
     second = [_value(each.b, each.b_interval, _digits(each)) for each in comparisons]
-    return [(Path(a.name).name, count, first), (Path(b.name).name, count, second)]
+    return [[Path(a.name).name, count, *first], [Path(b.name).name, count, *second]]
 
 
 def _digits(comparison: Comparison) -> str:
@@ -260,13 +248,6 @@ def _value(value: float, interval: Interval, digits: str) -> str:
     return f"{value:{digits}} [{low}, {high}]"
 
 
-def _markdown(name: str, count: str, cells: Sequence[str]) -> str:
-    return f"| {' | '.join([name, count, *cells])} |"
-
-
-def _latex(name: str, count: str, cells: Sequence[str]) -> str:
-    escaped = [
-        cell.replace("_", r"\_").replace("%", r"\%").replace("&", r"\&")
-        for cell in (name, count, *cells)
-    ]
+def _latex(cells: Sequence[str]) -> str:
+    escaped = [re.sub(r"[_%&]", r"\\\g<0>", cell) for cell in cells]
     return f"{' & '.join(escaped)} \\\\"

@@ -1,6 +1,5 @@
 """PASCAL3D+: viewpoints, also up to the symmetries of its classes."""
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -121,12 +120,8 @@ class Pascal3DBenchmark(Benchmark):
         """Scores as :meth:`Benchmark.summary`, also as plain means over the classes, and those of
         easy objects by class, as some tables have them."""
         summary = super().summary(samples, rows, errors)
-        easy = self.subsets(samples)["easy"]
-        classes = defaultdict[str, list[int]](list)
-        for i, sample in enumerate(samples):
-            if easy[i]:
-                classes[sample["category"]].append(i)
-        easy_scores = {name: self.scores(rows, errors, classes[name]) for name in sorted(classes)}
+        easy = [i for i, is_easy in enumerate(self.subsets(samples)["easy"]) if is_easy]
+        easy_scores = self.scores_of_groups(samples, rows, errors, easy)
         summary["subsets"]["easy"] |= {
             "per_class": easy_scores,
             "mean_over_classes": _mean_scores(easy_scores),

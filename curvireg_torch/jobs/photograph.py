@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..data import load_camera
 from ..errors import CurviregError, InvalidInputError
-from ..geometry import Camera, camera_matrix
+from ..geometry import Camera
 from ..geometry.pose_prior import PosePrior
 from ..mesh import load_mesh
 from ..pipeline import Pipeline
@@ -166,15 +166,16 @@ def register(
     return register_entry(entry, prepare(entry, photo), mesh)
 
 
-def _camera(given: CameraLike | str | PathLike[str] | None) -> Camera | str | None:
-    """The camera of :func:`register`; "exif" stays this word."""
+def _camera(
+    given: CameraLike | str | PathLike[str] | None,
+) -> Camera | tuple[float, ...] | str | None:
+    """The camera of :func:`register`, as an :class:`.Entry` has it."""
     if given is None or isinstance(given, Camera):
         return given
     if isinstance(given, str | PathLike):
         return "exif" if given == "exif" else load_camera(given)
     K: Any = given
-    is_short = isinstance(given, Sequence) and len(given) == 4
-    return Camera(camera_matrix(*K) if is_short else K)
+    return tuple(K) if isinstance(K, Sequence) and len(K) == 4 else Camera(K)
 
 
 def register_entry(
