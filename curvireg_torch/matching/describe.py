@@ -80,14 +80,14 @@ class ViewDescriber:
     ) -> None:
         self._mesh = mesh = as_mesh(mesh)
         self.view_mesh = mesh.surface
-        self.renderer = self.view_renderer = make_renderer(mesh, renderer)
+        self.renderer = self.view_renderer = make_renderer(mesh, renderer, many_views=True)
         self.centre = mesh_centre(mesh)
         self.radius = mesh_radius(mesh)
         self.hull = extreme_points(mesh)
         self._device = torch.device(device)
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
             self.view_mesh = view_mesh(mesh)
-            self.view_renderer = make_renderer(self.view_mesh, renderer)
+            self.view_renderer = make_renderer(self.view_mesh, renderer, many_views=True)
         if renderer == "auto" and self._device.type != "cpu":
             self.view_renderer = DeviceRenderer(self.view_mesh, self._device)
         self._set(settings)

@@ -14,6 +14,9 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from torch import Tensor
 
+from ..geometry import camera_matrix, rotation_from_viewpoint
+from ..geometry.cameras import transform
+from ..mesh.edges import encloses_volumes
 from ..mesh.mesh import Mesh, box_corners, extreme_points
 from ..utils.threads import for_each
 from .renderer import NEAREST, MeshRenderer
@@ -24,6 +27,9 @@ _MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
 # Space, in object radii, between the object and the planes in front and behind it between which
 # OpenCV draws
 BESIDE = 1e-3
+MAX_CULLED_FACES = 10_000  # Checking larger meshes takes longer than it saves
+# Fraction of the object's pixels that may change where back faces are left out
+DIFFERENT_PIXELS = 1e-3
 # Depth, in object radii, beyond which single precision does not separate object and background
 FARTHEST = 1000.0
 
@@ -194,17 +200,32 @@ class RasterRenderer(EmbreeRenderer):
     """Draws into OpenCV's z-buffer, views in parallel on threads; casts rays where OpenCV is slower
     or wrong. The time of the z-buffer grows with the faces, that of ray casting with the pixels: it
     is used for meshes of fewer faces than the image has pixels. It does not clip faces that cross
-    the near plane, is not precise far away, and knows no parallel projection."""
+    the near plane, is not precise far away, and knows no parallel projection. For ``many_views`` of
+    at most ``MAX_CULLED_FACES`` faces it leaves out back faces, which halves the time, if all
+    surfaces are closed, none is inside out, and pictures from eight sides are the same."""
 
     name = "auto"
 
-    def __init__(self, mesh: Mesh | trimesh.Trimesh) -> None:
+    def __init__(self, mesh: Mesh | trimesh.Trimesh, *, many_views: bool = False) -> None:
         super().__init__(mesh)
         self._corners = self._scaled(box_corners(mesh))
         self._vertices = float32(self._scaled(mesh.vertices))[:, None]
         self._faces = np.array(mesh.faces, np.int32)[:, None]
-        self._settings = cv2.TriangleRasterizeSettings()
-        self._settings.setCullingMode(cv2.RASTERIZE_CULLING_NONE)
+        self.draws_back_faces = True
+        if many_views and len(self._faces) <= MAX_CULLED_FACES and encloses_volumes(mesh):
+            before = self._from_corners()
+            self.draws_back_faces = False
+            different = (self._from_corners() != before).sum()
+            self.draws_back_faces = bool(different > DIFFERENT_PIXELS * (before > 0).sum())
+
+    def _from_corners(self) -> Tensor:
+        """(8, 1, 128, 128) depth from the corners of a cube around the object."""
+        azimuths = torch.arange(45.0, 765.0, 90.0).double()
+        elevations = torch.tensor([35.3, -35.3]).repeat_interleave(4)
+        place = torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64)
+        R = rotation_from_viewpoint(azimuths, elevations.double())
+        K = camera_matrix(220.0, 220.0, 63.5, 63.5, dtype=torch.float64)
+        return self._depth(transform(R, place.expand(8, 3)), K.expand(8, 3, 3), (128, 128), False)
 
     def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
         if orthographic or len(self._faces) > size[0] * size[1]:
@@ -238,9 +259,13 @@ class RasterRenderer(EmbreeRenderer):
         y = [0.0, -2.0 * K[1, 1], -(2.0 * K[1, 2] - (H - 1))]
         shear = np.array([x, y, [0.0, 0.0, -H]]) / H
         camera = (shear @ T[:3]).astype(np.float32)
+        settings = cv2.TriangleRasterizeSettings()
+        settings.setCullingMode(
+            cv2.RASTERIZE_CULLING_NONE if self.draws_back_faces else cv2.RASTERIZE_CULLING_CW
+        )
         z = np.full(size, far, np.float32)
         cv2.triangleRasterizeDepth(
-            self._vertices, self._faces, z, camera, math.pi / 2.0, near, far, self._settings
+            self._vertices, self._faces, z, camera, math.pi / 2.0, near, far, settings
         )
         z *= z <= far - 0.5 * BESIDE
         return z

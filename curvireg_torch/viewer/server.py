@@ -190,16 +190,13 @@ def guarded(site: ASGIApp, *hosts: str) -> ASGIApp:
             or is_open
             or (named is not None and _plain_host(named[1]) in names)
         )
+        answer = site
         if any(urlsplit(origin).netloc.lower() != own for origin in headers.getlist("origin")):
-            refusal = PlainTextResponse("requests of other sites are refused", status_code=403)
-            await refusal(scope, receive, send_with_headers)
+            answer = PlainTextResponse("requests of other sites are refused", status_code=403)
         elif not is_known:
-            refusal = PlainTextResponse(
-                "this is not the name of the page's machine", status_code=400
-            )
-            await refusal(scope, receive, send_with_headers)
-        else:
-            await site(scope, receive, send_with_headers)
+            words = "this is not the name of the page's machine"
+            answer = PlainTextResponse(words, status_code=400)
+        await answer(scope, receive, send_with_headers)
 
     return guard
 

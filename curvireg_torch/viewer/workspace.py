@@ -165,11 +165,9 @@ class Workspace:
         """Find the pose in the photograph that is shown, as soon as files are open; one search at a
         time."""
         if self._search is None:
-            self.session.progress, self.session.cancelled, self.started = (
-                ("", 0, 1),
-                False,
-                time.monotonic(),
-            )
+            self.session.progress = ("", 0, 1)
+            self.session.cancelled = False
+            self.started = time.monotonic()
             self._begun = False
             self.examination.waits = True
             self._search = asyncio.create_task(self._find())

@@ -60,7 +60,7 @@ def test_backends_agree(pair, name, orthographic):
     radius = mesh_radius(mesh)
     T, K, size = camera(6, radius=radius, centre=mesh_centre(mesh), orthographic=orthographic)
     a, b = (
-        make_renderer(mesh, backend).render(T, K, size, orthographic=orthographic)
+        make_renderer(mesh, backend, many_views=True).render(T, K, size, orthographic=orthographic)
         for backend in pair
     )
     inside = interior(a, b)
@@ -69,6 +69,14 @@ def test_backends_agree(pair, name, orthographic):
     assert even.sum() > 5000
     assert (a - b)[even].abs().max() <= 1e-5 * radius
     assert ((a > 0) != (b > 0)).sum() <= 10  # rounding at contours, in six views
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_back_faces_of_closed_surfaces_are_not_drawn(name):
+    assert make_renderer(MESHES[name]()).draws_back_faces, "both sides of a face are visible"
+    assert make_renderer(MESHES[name](), many_views=True).draws_back_faces == (
+        name not in ("parts", "fine", "knot")
+    )
 
 
 @cache
