@@ -85,8 +85,9 @@ def test_frame_reader_decodes_once_for_numbers_in_order(five, monkeypatch):
     for number in (0, 1, 3, 4):
         assert torch.equal(reader.read(number), frames[number])
     assert opened == [1]
-    assert torch.equal(reader.read(0), frames[0]), "again from the start"
-    assert opened == [1, 1]
+    for _ in range(2):
+        assert torch.equal(reader.read(0), frames[0]), "again from the start"
+    assert opened == [1, 1, 1]
     assert torch.equal(FrameReader(five, every=3).read(3), frames[3])
     with pytest.raises(ImageError, match=r"five\.avi: no frame 9"):
         reader.read(9)

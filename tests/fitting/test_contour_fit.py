@@ -9,11 +9,13 @@ from torch.testing import assert_close
 
 from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.fitting import contour_fit
 from curvireg_torch.fitting.contour_fit import fit_to_edges, short_fit
 from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
 from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask
 from curvireg_torch.fitting.least_squares import apply_twist, project
 from curvireg_torch.fitting.measured_fit import contour_support
+from curvireg_torch.geometry import axis_angle_from_rotation
 from curvireg_torch.geometry.framing import inside_boxes, photograph_box
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
@@ -265,6 +267,26 @@ def test_fit_begins_from_rotations_of_the_start_too(degrees):
     start = apply_twist(CUBE_POSE[None], twist, mesh_centre(cube()))
     found = fitted(silhouette(cube(), CUBE_POSE), start).transform[0]
     assert rotation_error(found[:3, :3], CUBE_POSE[:3, :3]) < 2.0
+
+
+def test_a_fit_begins_around_its_start_and_farther_away_if_it_is_a_second_one(monkeypatch):
+    """From rotations in degrees about x, y and z."""
+    begun = []
+    promising = contour_fit._promising
+
+    def watched(half, around, count):
+        turns = axis_angle_from_rotation(around[0, :, :3, :3] @ CUBE_POSE[:3, :3].T).rad2deg()
+        begun.append({tuple(turn) for turn in turns.round().int().tolist()})
+        return promising(half, around, count)
+
+    monkeypatch.setattr(contour_fit, "_promising", watched)
+    crops = EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1)
+    T = CUBE_POSE[None]
+    for refit in (False, True):
+        fit_to_edges(MeshContours(cube()), crops, K[None], T, FIRST, short_fits=T, refit=refit)
+    near = {(0, 0, 0), (8, 0, 0), (-8, 0, 0), (0, 8, 0), (0, -8, 0), (0, 0, 6), (0, 0, -6)}
+    far = {(16, 0, 0), (-16, 0, 0), (0, 16, 0), (0, -16, 0)}
+    assert begun == [near, near | far]
 
 
 def test_fit_without_edges_returns_the_start():

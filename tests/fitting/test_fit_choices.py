@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from curvireg_torch.fitting import contour_fit
-from curvireg_torch.fitting.contour_fit import fit_to_edges
+from curvireg_torch.fitting.contour_fit import COARSE_DENSITY, fit_to_edges
 from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.least_squares import apply_twist
@@ -45,6 +46,29 @@ def test_the_weighted_support_decides_and_the_plain_one_is_reported(monkeypatch)
     fit = fitted(monkeypatch, start, lambda _, __, plain: plain)
     assert not fit.transform.equal(start)
     assert fit.edge_support > float(fit.start_support)
+
+
+def test_the_starts_with_the_most_weighted_support_go_on(monkeypatch):
+    """By these weights the last three."""
+    begun = []
+    went_on = []
+    fit_at_half_size = contour_fit._fitted_at_half_size
+
+    def weigh(problem, state, plain):
+        if problem.density != COARSE_DENSITY:
+            return 1.0 - plain
+        begun.append(state.T)
+        return torch.arange(len(plain)).double()
+
+    def watched(half, T):
+        went_on.append(T[0])
+        fits, supports = fit_at_half_size(half, T)
+        assert_close(supports[0], 1.0 - half.supports(fits)[0])
+        return fits, supports
+
+    monkeypatch.setattr(contour_fit, "_fitted_at_half_size", watched)
+    fitted(monkeypatch, starts(6.0), weigh)
+    assert went_on[0].equal(begun[0][[-1, -2, -3]])
 
 
 def test_a_start_that_is_not_finished_has_its_fit_if_that_is_better_by_weight(monkeypatch):

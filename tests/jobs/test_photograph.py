@@ -16,7 +16,7 @@ from curvireg_torch.data import Photo
 from curvireg_torch.jobs import photograph
 from curvireg_torch.jobs.entry import Entry, prepare
 from curvireg_torch.jobs.outputs import MARKER
-from tests._support import found_in, learned_registrar, scene, two_trucks
+from tests._support import found_in, learned_registrar, refused, scene, two_trucks
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, write_files
 
@@ -116,6 +116,15 @@ def test_result_is_shown_in_ten_lines_and_in_notebooks(result):
         Rotation.from_quat([x, y, z, w]).as_matrix(), result.rotation.numpy(), atol=1e-9
     )
     assert result.T_cam_from_model[:3, 3].equal(result.translation)
+
+
+@pytest.mark.parametrize("given", [{"unit": "mm"}, {"up": "y"}])
+def test_a_bank_and_a_registrar_have_the_unit_and_the_axis_of_their_mesh(folder, given):
+    photo = folder / "photos" / "0.png"
+    with refused(r"learned\.safetensors: built with", cr.errors.BankError):
+        cr.register(photo, folder / "learned.safetensors", **given)
+    with refused("unit, up: of a mesh file"):
+        cr.register(photo, learned_registrar(), **given)
 
 
 def test_every_copy_is_drawn_and_saved(tmp_path, monkeypatch):

@@ -19,6 +19,7 @@ from curvireg_torch.geometry import (
     viewpoint_from_rotation,
 )
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
+from curvireg_torch.matching.detector import _medoids
 from curvireg_torch.registration import Detector, Proposals, detect, stages
 from curvireg_torch.registration import detection as detection_module
 from curvireg_torch.registration.detection import RegisteredBox, _add, _allowed_views
@@ -272,6 +273,13 @@ def test_detector_finds_the_object(seed, corner, scale):
     )
 
 
+def test_medoids_are_the_centres_of_clusters():
+    order = torch.randperm(9, generator=seeded(0))
+    points = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 5.2, 9.0, 9.1, 9.2])[order]
+    medoids = _medoids((points[:, None] - points).square(), 3)
+    assert sorted(points[medoids].tolist()) == pytest.approx([0.1, 5.1, 9.1])
+
+
 def test_distance_limits_each_box_by_its_view():
     """To half a step of sizes, and what rounding a size to cells of 16 px adds."""
     image, _, T = scene(1)
@@ -366,10 +374,11 @@ def test_boxes_around_poses_are_registered_where_they_are_more_certain(monkeypat
 
 
 def test_places_of_one_object_leave_room_for_others(monkeypatch):
-    """The first two lead to one object, and a third takes the place of the second; the most
-    probable object comes first."""
+    """The first three lead to one object, and another takes their place, though one was asked for.
+    It is the more probable one."""
     boxes = torch.cat([box_at(20.0 * k, 0.0).box[None] for k in range(4)])
-    there = {9.0: box_at(0.0, 0.9, 0.5), 8.0: box_at(0.0, 0.8, 0.5), 7.0: box_at(40.0, 0.7)}
+    same = {response: box_at(0.0, response / 10, 0.5) for response in (9.0, 8.0, 7.0)}
+    there = {**same, 6.0: box_at(40.0, 0.6)}
     asked = []
 
     def registered(_, __, some):
@@ -384,9 +393,9 @@ def test_places_of_one_object_leave_room_for_others(monkeypatch):
         lambda _, __, some: [replace(one, score=one.response / 10) for one in some],
     )
     proposals = Proposals(boxes, torch.tensor([9.0, 8, 7, 6]), torch.zeros(4, dtype=torch.long))
-    found = detection_module._register_candidates(None, {}, {0: proposals}, 2)
-    assert asked == [[9.0, 8.0], [7.0]]
-    assert [one.score for one in found[0]] == [0.7, 0.9]
+    found = detection_module._register_candidates(None, {}, {0: proposals}, 1)
+    assert asked == [[9.0, 8.0], [7.0], [6.0]]
+    assert [one.score for one in found[0]] == [0.6]
 
 
 def test_photographs_are_searched_together_as_alone(registrar, found, monkeypatch):

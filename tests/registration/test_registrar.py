@@ -18,11 +18,19 @@ from curvireg_torch import (
     sample_views,
 )
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
+from curvireg_torch.fitting import contour_fit
 from curvireg_torch.geometry import Camera, box_iou
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.pipeline import PRESETS, FitSettings
-from curvireg_torch.registration import FailedRegistration, Follower, block, several, stages
+from curvireg_torch.registration import (
+    FailedRegistration,
+    Follower,
+    block,
+    hypotheses,
+    several,
+    stages,
+)
 from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration.photograph import Photograph, check_crop
 from curvireg_torch.rendering import make_renderer
@@ -144,6 +152,28 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
     (result,) = stages.register(registrar, [item], query)
     assert (float(degrees_off(result, TRUTH)) < 4) == right
     assert len(result.hypotheses) == registrar.pipeline.hypotheses
+
+
+def counted(function, place, counts):
+    """The function, which appends how many poses it gets in a ``place``."""
+
+    def call(*given, **options):
+        counts.append(len(given[place]))
+        return function(*given, **options)
+
+    return call
+
+
+def test_views_have_one_short_fit_and_three_are_fitted_even_if_one_is_reported(monkeypatch):
+    """The best pose is fitted twice."""
+    short_fits = []
+    fits = []
+    for module in (contour_fit, hypotheses):
+        monkeypatch.setattr(module, "short_fit", counted(module.short_fit, 3, short_fits))
+    monkeypatch.setattr(block, "fit_poses", counted(block.fit_poses, 2, fits))
+    assert len(answer_of(truck_registrar(hypotheses=1), IMAGE, BOX).hypotheses) == 1
+    assert short_fits == [FitSettings().screened_views, 1]
+    assert fits == [3, 1]
 
 
 def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evidence import EvidenceWeights
-from curvireg_torch.fitting.focal_length import USUAL_FOCAL, FocalInformation
+from curvireg_torch.fitting.focal_length import USUAL_FOCAL, FocalInformation, scaled_cameras
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import Camera
 from curvireg_torch.geometry.cameras import point_in_cameras
@@ -63,6 +63,38 @@ def test_starts_are_the_best_view_of_each_camera_and_the_best_views():
     assert found == sorted(expected, key=lambda place: -float(ranked[place]))
     every = camera_module.best_of_fields(ranked, 4)
     assert sorted((every % 4).tolist()) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("source", "factors"), [("estimated", [2, 1]), ("exif", [1])])
+def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source, factors):
+    """Each fit moves the pose by 1 to the right, and adds 0.1 to log f."""
+    poses = poses_at(1)
+    fitted = []
+
+    def problem(_, __, K, ___, *, factor=1):
+        return SimpleNamespace(factor=factor, K=K, edge_support=lambda _: torch.ones(1))
+
+    def fit(problem, T, *_):
+        fitted.append(problem.factor)
+        T = T.clone()
+        T[0, 0, 3] += 1.0
+        state = SimpleNamespace(T=T)
+        return SimpleNamespace(problem=problem, state=state, log_zoom=double([0.1]))
+
+    def measured(_, state, support, __):
+        return replace(poses.fit, transform=state.T, edge_support=support.double())
+
+    monkeypatch.setattr(camera_module.ContourProblem, "of", problem)
+    monkeypatch.setattr(camera_module, "fit_focal_length", fit)
+    monkeypatch.setattr(camera_module, "measured_fit", measured)
+    describer = SimpleNamespace(contours=None, centre=CENTRE)
+    camera = Camera(CAMERA, focal_deviation=0.1, source=source)
+    item = Photograph(torch.zeros(3, *SIZE), BOX, camera)
+    found = camera_module.with_focal_length(describer, NOTHING, poses, item)
+    assert fitted == factors
+    assert float((found.T - poses.T)[0, 0, 3]) == len(factors)
+    assert_close(found.cameras, scaled_cameras(poses.cameras, double([0.1 * len(factors)])))
+    assert float(found.edge_support) == 1.0
 
 
 def test_the_covariance_is_that_of_the_origin(monkeypatch):
@@ -148,6 +180,32 @@ def test_fits_also_begin_from_the_focal_length_of_another_pose():
     assert starts.tolist() == pytest.approx([500.0, 550.0, 650.0, 350.0, 650.0, 500.0, 500.0])
     alone = torch.tensor([2])
     assert camera_module._focal_starts(alone, focal_lengths)[0].tolist() == [2]
+
+
+def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(monkeypatch):
+    """The third pose is outside the limits, and the last one of a photograph of a known camera."""
+    poses = poses_at(4)
+    poses = replace(
+        poses,
+        cameras=scaled_cameras(poses.cameras, double([0.0, 0.1, 0.2, 0.3])),
+        covariance=torch.ones(4, 6, 6).double(),
+        evidence=evidence_of(0.7, 0.8, 0.9, 0.6),
+        is_outside=torch.tensor([False, False, True, False]),
+        photograph=torch.tensor([0, 0, 0, 1]),
+    )
+    best = torch.full((1, 6, 6), 2.0).double()
+    monkeypatch.setattr(camera_module, "focal_covariance", lambda *_: (best, 0.07))
+    target = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), describer=None)
+    cameras = Camera(CAMERA, focal_deviation=0.1), Camera(CAMERA)
+    items = [Photograph(torch.zeros(3, *SIZE), BOX, camera) for camera in cameras]
+    block = SimpleNamespace(photographs=items, with_photographs=dict.items)
+    ((p, item),), after = camera_module.with_focal_deviation(target, block, NOTHING, poses)
+    assert p == 0
+    assert item.focal_deviation == 0.07
+    assert torch.equal(item.K, poses.cameras[1])
+    assert after.covariance[[0, 2]].isnan().all()
+    assert torch.equal(after.covariance[[1]], best)
+    assert torch.equal(after.covariance[3], poses.covariance[3])
 
 
 def test_limits_of_an_unknown_camera_are_wider_by_how_far_the_box_is_off_the_axis(monkeypatch):

@@ -8,7 +8,7 @@ from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.rendering.visibility import FaceTests
 from curvireg_torch.rendering.zbuffer import DeviceRenderer
 from curvireg_torch.synthetic import example_mesh, random_pose
-from tests._support import seeded
+from tests._support import double, seeded
 
 MESHES = {
     "truck": example_mesh,
@@ -93,11 +93,24 @@ def test_depth_of_the_device_is_that_of_rays(name):
 def test_views_that_the_camera_plane_cuts_are_drawn_by_rays():
     mesh = example_mesh()
     T, K = poses_of(mesh, 96, 2)
-    T[0, :3, 3] = 0.0  # the camera is within the object
+    contours = MeshContours(mesh)
+    # the camera is within the object, which surrounds it
+    T[0, :3, 3] = double([0.0, 0.0, 0.5 * contours.radius]) - T[0, :3, :3] @ contours.centre
     expected = make_renderer(mesh, "embree").render(T, K, (64, 64))
+    assert (expected[0] > 0).all()
     depth = DeviceRenderer(mesh, "cpu").render(T, K, (64, 64))
     assert torch.equal(depth[0], expected[0])
     assert (depth[1] > 0).any()
+
+
+def test_parallel_projections_are_drawn_by_rays():
+    mesh = example_mesh()
+    T, K = poses_of(mesh, 96, 1)
+    K[0, 0] = K[1, 1] = 30.0 / MeshContours(mesh).radius  # px per unit
+    given = T, K, (96, 96)
+    expected = make_renderer(mesh, "embree").render(*given, orthographic=True)
+    assert (expected > 0).sum() > 150
+    assert torch.equal(DeviceRenderer(mesh, "cpu").render(*given, orthographic=True), expected)
 
 
 def test_depth_does_not_depend_on_the_batch(monkeypatch):

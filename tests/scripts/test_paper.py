@@ -145,6 +145,21 @@ def test_focus_curves_by_threshold_and_precision_by_protocol(root):
     assert [row[0] for row in protocols.rows] == list(tables.PROTOCOLS)
 
 
+def test_a_mesh_is_rendered_once():
+    renderer = measure.Remembered(example_mesh())
+    renderer._inner = Mock(wraps=renderer._inner)
+    T = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    T[:, 2, 3] = torch.tensor([1.0, 2.0])
+    K, longer = (camera_matrix(f, f, 31.5, 31.5, dtype=torch.float64)[None] for f in (100.0, 120.0))
+    first = renderer.render(T, K, (64, 64))
+    assert torch.equal(renderer.render(T, K, (64, 64)), first)
+    assert renderer._inner.render.call_count == 1
+    for other in ((T.flip(0), K, (64, 64)), (T, longer, (64, 64)), (T, K, (32, 32))):
+        assert not torch.equal(renderer.render(*other), first)
+    assert not torch.equal(renderer.render(T, K, (64, 64), orthographic=True), first)
+    assert renderer._inner.render.call_count == 5
+
+
 def test_bootstrap_resamples_cads():
     values = [0.0] * 10 + [1.0] * 10
     alone = bootstrap(values, [str(i) for i in range(20)])
