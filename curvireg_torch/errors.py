@@ -212,7 +212,7 @@ MIN_MESH_EXTENT = 1e-6
 MAX_MESH_PARTS = 10_000
 MAX_CAD_BYTES = 1 << 27  #: Bytes of a STEP, IGES or Collada file
 MAX_CAD_SECONDS = 300  #: Time in which OpenCASCADE must have made triangles of a STEP or IGES file
-#: Memory of the process in which OpenCASCADE or OpenUSD reads a file, in bytes
+#: Memory of the process in which OpenCASCADE, OpenUSD or SciPy reads a file, in bytes
 MAX_CAD_MEMORY = 4 << 30
 #: Elements of an XML file, as Collada and URDF are; each takes up to 300 bytes
 MAX_XML_ELEMENTS = 5_000_000
@@ -225,7 +225,7 @@ MAX_TABLE_BYTES = 1 << 25
 MAX_LIST_COLUMNS = 1000  #: Columns of a list of photographs; each row has a text for each
 MAX_RIG_VIEWS = 10_000  #: Photographs of a rig
 MAX_CAMERA_BYTES = 1 << 22  #: Bytes of a calibration file
-MAX_MAT_BYTES = 1 << 20  #: Bytes of a MATLAB annotation file, and of what it unpacks to
+MAX_MAT_BYTES = 1 << 20  #: Bytes of a MATLAB annotation file
 #: Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a
 #: notice
 MAX_VIEWER_FACES = 300_000

@@ -19,7 +19,7 @@ from ..errors import CurviregError, CurviregWarning
 from ..jobs.options import with_advice
 from ..utils.files import as_stored, terminable
 from ..version import __version__
-from . import commands, compare, follow, inspect, register
+from . import commands, follow, register
 from .options import CONFLICTS, Parser, conflict, given_options, join_numbers
 
 __all__ = ["build_parser", "main", "parse"]
@@ -110,13 +110,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = Parser(prog="curvireg", description="Pose of a known 3D object from one photograph.")
     parser.add_argument("--version", action="version", version=f"curvireg_torch {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (
-        register.add_register,
-        follow.add_follow,
-        inspect.add_inspect,
-        *commands.COMMANDS,
-        compare.add_compare,
-    ):
+    for add in (register.add_register, follow.add_follow, *commands.COMMANDS):
         add(subparsers)
     return parser
 

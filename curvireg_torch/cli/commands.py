@@ -1,8 +1,9 @@
-"""The commands ``curvireg bank``, ``cache``, ``evaluate``, ``view``, ``plot`` and ``demo``."""
+"""The commands of the command line but for ``register`` and ``follow``."""
 
 import argparse
+import json
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from .options import (
     input_files,
     register_options,
 )
+from .stages import shown_stages
 
 LOCAL = "127.0.0.1"
 PICTURES = {
@@ -45,6 +47,85 @@ PROTOCOL = (
     "views=N: N photographs of one pose together (bop; seed=N)"
 )
 FORMATS = (".png", ".svg", ".pdf")
+
+
+def _add_inspect(commands: Any) -> None:
+    parser = add_command(
+        commands,
+        "inspect",
+        "curvireg inspect part.stl --unit mm --out out/inspect",
+        "curvireg inspect chair.glb --pose upright --no-camera --n 200 --out out/chair",
+        help="what to expect of photographs of MESH: symmetries, views that look alike, share of "
+        "right answers",
+        description="Writes DIR/inspect.json and DIR/inspect.html, from generated photographs of "
+        "the mesh.",
+        run=_run_inspect,
+    )
+    add_path(parser, "mesh", "MESH")
+    add_path(parser, "--out", "DIR", required=True, help="folder of the report")
+    add = parser.add_argument
+    add(
+        "--n",
+        type=whole_number(0),
+        default=60,
+        metavar="N",
+        help="generated photographs (default: 60; 0: none)",
+    )
+    add("--seed", type=int, default=0, help="of the photographs (default: 0)")
+    add(
+        "--no-camera",
+        dest="with_camera",
+        action="store_false",
+        help="as if the camera were unknown",
+    )
+    add_path(
+        parser, "--photo", "DIR", help="your own photographs without the object, as backgrounds"
+    )
+    add(
+        "--clutter",
+        action="store_true",
+        help="other objects around the object, and at times in front of it",
+    )
+    add("--strict", action="store_true", help="exit code 3 for a mesh that cannot work")
+    add_options(parser, *MESH, *METHOD)
+
+
+def _run_inspect(arguments: argparse.Namespace) -> int:
+    """Write the report and print it."""
+    check_given([], [arguments.mesh], banks=False)
+    load_libraries()
+    from ..inspection import inspect
+    from ..inspection.page import report_lines, report_page
+    from ..jobs.lists import find_photographs
+    from ..jobs.outputs import output_folder
+
+    backgrounds = [] if arguments.photo is None else find_photographs(arguments.photo)
+    options = register_options(arguments)
+    inputs = input_files(arguments, arguments.mesh, *backgrounds)
+    with output_folder(arguments.out, "inspect", inputs=inputs):
+        with shown_stages(shown=options.progress) as show:
+            report = inspect(
+                options.load_mesh(arguments.mesh),
+                n=arguments.n,
+                seed=arguments.seed,
+                with_camera=arguments.with_camera,
+                pipeline=options.open_pipeline(),
+                renderer=options.renderer,
+                device=options.device,
+                backgrounds=backgrounds,
+                clutter=arguments.clutter,
+                progress=show,
+            )
+        content = json.dumps(report.to_dict(), indent=2) + "\n"
+        write_file(arguments.out / "inspect.json", content.encode())
+        page = report_page(report, report.registrar, title=arguments.mesh.name)
+        write_file(arguments.out / "inspect.html", page.encode(errors="backslashreplace"))
+    print(
+        "\n".join(
+            [f"{arguments.mesh}", *report_lines(report), f"see {arguments.out / 'inspect.html'}"]
+        )
+    )
+    return 3 if arguments.strict and report.is_hopeless else 0
 
 
 def _add_bank(commands: Any) -> None:
@@ -75,7 +156,7 @@ def _build_bank(arguments: argparse.Namespace) -> None:
 
     start = time.perf_counter()
     options = register_options(arguments)
-    check_output_file(arguments.out, input_files(arguments, arguments.mesh), mark=b"curvireg")
+    check_output_file(arguments.out, input_files(arguments, arguments.mesh))
     pipeline = options.open_pipeline()
     mesh = options.load_mesh(arguments.mesh)
     with one_torch_thread():
@@ -290,9 +371,7 @@ def draw(arguments: argparse.Namespace) -> None:
     from ..visualization import plots
 
     options = register_options(arguments, [arguments.photo], [arguments.mesh])
-    check_output_file(
-        arguments.out, input_files(arguments, arguments.photo, arguments.mesh), mark=b"curvireg"
-    )
+    check_output_file(arguments.out, input_files(arguments, arguments.photo, arguments.mesh))
     entry = entry_of(arguments.photo, options)
     photograph = prepare(entry)
     with one_torch_thread():
@@ -365,4 +444,46 @@ def demo(arguments: argparse.Namespace) -> None:
     )
 
 
-COMMANDS = (_add_bank, _add_cache, _add_evaluate, _add_view, _add_plot, _add_demo)
+def _add_compare(commands: Any) -> None:
+    parser = add_command(
+        commands,
+        "compare",
+        "curvireg compare out/lm-fast out/lm",
+        "curvireg compare out/lm-fast out/lm --json",
+        help="compare two evaluations of one dataset, object by object",
+        description="Prints each score with its 95 % interval, how often B is better than A and "
+        "worse,\n"
+        "the p of a sign test, and a Markdown and a LaTeX row of each run. Objects in one run "
+        "only do not count.",
+        run=_compare_runs,
+    )
+    add_path(parser, "a", "RUN_A", help="folder of 'curvireg evaluate --out'")
+    add_path(parser, "b", "RUN_B", help="another one, of the same dataset")
+    parser.add_argument("--json", action="store_true", help="print the comparison as JSON")
+
+
+def _compare_runs(arguments: argparse.Namespace) -> None:
+    """Compare two evaluations."""
+    from ..evaluation.compare import compare, in_words, read_run
+    from ..jobs.store import to_json
+
+    first = read_run(arguments.a)
+    second = read_run(arguments.b)
+    comparisons = compare(first, second)
+    if not arguments.json:
+        print(in_words(first, second, comparisons), end="")
+        return
+    scores = [asdict(each) for each in comparisons]
+    print(to_json({"a": first.name, "b": second.name, "comparisons": scores}), end="")
+
+
+COMMANDS = (
+    _add_inspect,
+    _add_bank,
+    _add_cache,
+    _add_evaluate,
+    _add_view,
+    _add_plot,
+    _add_demo,
+    _add_compare,
+)

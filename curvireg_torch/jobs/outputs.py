@@ -25,6 +25,7 @@ except ImportError:  # no locks on Windows
     fcntl = None  # type: ignore[assignment]
 
 MARKER = ".curvireg.json"
+MARK = b"curvireg"  # in each bank and picture
 
 FOR_TOOLS = (*ros.FILES, *trackers.M3T_FILES, *trackers.VISP_FILES)
 ONE_RESULT = ("result.json", "overlay.png", "pose.glb", *FOR_TOOLS)
@@ -135,15 +136,15 @@ def _check_source(
         raise _refused(folder, f"a run of {lost[0]} was stopped here; remove {MARKER} in it, or ")
 
 
-def check_output_file(path: Path, inputs: Iterable[Path], *, mark: bytes) -> None:
-    """Refuse to write a file that is an input, or that exists without ``mark``, by which this
+def check_output_file(path: Path, inputs: Iterable[Path]) -> None:
+    """Refuse to write a file that is an input, or that exists without ``MARK``, by which this
     program's own are known.
 
     The folder is checked too, so that no work is lost.
     """
     if path.exists():
         _check_inputs([path], inputs)
-        if not path.is_file() or mark not in path.read_bytes():
+        if not path.is_file() or MARK not in path.read_bytes():
             raise _refused(path, "exists, and this command did not write it; ")
     check_writable(path.parent)
 

@@ -192,40 +192,45 @@ def _rows(
     """The results of entries, which are registered together, and their thumbnails; the first pays
     for the bank, and one without a pose its share of the time."""
     start = time.perf_counter()
-    rows: dict[int, tuple[Row, bytes | None]] = {}
-    prepared: dict[int, tuple[Entry, Photograph]] = {}
-    found: dict[int, RegisteredPhotograph | CurviregError] = {}
-    for k, entry in enumerate(entries):
-        try:
-            photo = entry.read()
-        except (CurviregError, OSError) as error:
-            rows[k] = failed_row(error, skipped="unreadable_image"), None
-            continue
-        if isinstance(registrar, Exception):
-            rows[k] = failed_row(registrar, skipped="unreadable_mesh"), None
-            continue
-        try:
-            prepared[k] = entry, prepare(entry, photo)
-        except CurviregError as error:
-            found[k] = error
+    items = [_prepared(entry, registrar) for entry in entries]
+    ready = [
+        (entry, item)
+        for entry, item in zip(entries, items, strict=True)
+        if isinstance(item, Photograph)
+    ]
+    results: Iterator[RegisteredPhotograph | CurviregError] = iter(())
     if isinstance(registrar, Registrar):
-        together = register_entries(list(prepared.values()), registrar, bank_seconds=bank_seconds)
-        found |= zip(prepared, together, strict=True)
+        results = iter(register_entries(ready, registrar, bank_seconds=bank_seconds))
     share = (time.perf_counter() - start) / len(entries)
-    for k, one in found.items():
+    rows: list[tuple[Row, bytes | None]] = []
+    for k, item in enumerate(items):
+        one = next(results) if isinstance(item, Photograph) else item
         if isinstance(one, RegisteredPhotograph):
-            rows[k] = {"message": "", **line_document(one.document)}, _thumbnail(one)
+            rows.append(({"message": "", **line_document(one.document)}, _thumbnail(one)))
             continue
-        places: Row = {}
-        if isinstance(one, LostObjectError) and one.detection is not None:
-            picture = prepared[k][1].facts["picture"]
-            places = {
-                "detection": places_document(one.detection),
-                "inputs": {"picture": picture},
-            }
-        seconds = {"bank": 0.0 if k else bank_seconds, "register": share}
-        rows[k] = failed_row(one, seconds=seconds, **places), None
-    return [rows[k] for k in range(len(entries))]
+        if isinstance(one, CurviregError):
+            seconds = {"bank": 0.0 if k else bank_seconds, "register": share}
+            places: Row = {}
+            if isinstance(item, Photograph) and isinstance(one, LostObjectError) and one.detection:
+                places["detection"] = places_document(one.detection)
+                places["inputs"] = {"picture": item.facts["picture"]}
+            one = failed_row(one, seconds=seconds, **places)
+        rows.append((one, None))
+    return rows
+
+
+def _prepared(entry: Entry, registrar: Registrar | Exception) -> Photograph | CurviregError | Row:
+    """The photograph of an entry, why it cannot be registered, or the row of unreadable files."""
+    try:
+        photo = entry.read()
+    except (CurviregError, OSError) as error:
+        return failed_row(error, skipped="unreadable_image")
+    if isinstance(registrar, Exception):
+        return failed_row(registrar, skipped="unreadable_mesh")
+    try:
+        return prepare(entry, photo)
+    except CurviregError as error:
+        return error
 
 
 def _thumbnail(found: RegisteredPhotograph) -> bytes:

@@ -171,11 +171,11 @@ def test_damaged_markers_are_refused(tmp_path, content):
 
 def test_files_that_are_named_are_replaced_only_with_our_mark(tmp_path):
     file = tmp_path / "new" / "overlay.png"
-    check_output_file(file, [], mark=b"curvireg")
+    check_output_file(file, [])
     file.write_bytes(b"a picture")
     with refused(r"overlay\.png: exists, and this command did not write it"):
-        check_output_file(file, [], mark=b"curvireg")
+        check_output_file(file, [])
     file.write_bytes(b"a picture by curvireg")
-    check_output_file(file, [], mark=b"curvireg")
+    check_output_file(file, [])
     with refused(r"overlay\.png: an input"):
-        check_output_file(file, [file], mark=b"curvireg")
+        check_output_file(file, [file])
