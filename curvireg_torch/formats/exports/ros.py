@@ -5,7 +5,6 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import yaml
 
 from ...errors import InvalidInputError
@@ -76,7 +75,8 @@ def write_ros(
         "tf.yaml": {"transforms": [transform]},
     }
     if document["covariance"] is not None:
-        covariance = np.ravel(ros_covariance(document["covariance"], metres)).tolist()
+        rows = ros_covariance(document["covariance"], metres)
+        covariance = [number for row in rows for number in row]
         message = {"header": header, "pose": {"pose": pose, "covariance": covariance}}
         contents["pose_with_covariance.yaml"] = message
     for name, content in contents.items():
@@ -95,7 +95,5 @@ def ros_covariance(covariance: Sequence[Sequence[float]], metres: float) -> list
         >>> [row[3] for row in ros_covariance(ours, 0.001)]
         [0.2, 0.0, 0.0, 1.0, 0.0, 0.0]
     """
-    scale = np.array([1.0, 1.0, 1.0, metres, metres, metres])
-    scaled = np.array(covariance) * np.outer(scale, scale)
-    ordered: list[list[float]] = scaled[np.ix_(ORDER, ORDER)].tolist()
-    return ordered
+    scale = (1.0, 1.0, 1.0, metres, metres, metres)
+    return [[covariance[i][j] * (scale[i] * scale[j]) for j in ORDER] for i in ORDER]
