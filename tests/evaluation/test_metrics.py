@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import metrics
-from curvireg_torch.geometry import rotation_error
+from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from tests._support import double, eye, seeded, uniform
 from tests._support.poses import poses, rotations
 
@@ -132,6 +132,22 @@ def test_mssd_and_mspd_against_loops(monkeypatch):
         monkeypatch.setattr(metrics, "BOUNDING_POINTS", few)
         assert_allclose(metrics.mssd_error(EST, GT, POINTS, symmetries=symmetries), mssd)
         assert_allclose(metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd)
+
+
+def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(monkeypatch):
+    """Scores of cans with 315 symmetries took minutes."""
+    symmetries = eye(4).repeat(315, 1, 1)
+    angles = torch.arange(315).double() * (2.0 * math.pi / 315)
+    symmetries[:, :3, :3] = rotation_from_axis_angle(angles[:, None] * double([0.0, 0.0, 1.0]))
+    points = uniform(6000, 3) - 0.5
+    moved = []
+    transform = metrics._transform
+    monkeypatch.setattr(
+        metrics, "_transform", lambda T, x: moved.append(len(T) * len(x)) or transform(T, x)
+    )
+    metrics.mssd_error(EST, GT, points, symmetries=symmetries)
+    metrics.mspd_error(EST, GT, points, K, symmetries=symmetries)
+    assert sum(moved) < 0.25 * 3 * len(EST) * 315 * len(points)
 
 
 def test_mspd_error_is_infinite_for_points_behind_the_camera():

@@ -242,6 +242,21 @@ def test_upright_photographs_are_seen_from_the_side(monkeypatch):
 
 
 @pytest.mark.slow
+def test_clutter_differs_from_photograph_to_photograph(monkeypatch):
+    radii = []
+
+    def object_of(radius, _):
+        radii.append(radius)
+        return trimesh.creation.icosphere(1, radius)
+
+    monkeypatch.setattr("curvireg_torch.inspection.photographs._random_object", object_of)
+    generate = PhotographGenerator(trimesh.creation.box((1, 2, 3)), 0, clutter=True)
+    generate(0)
+    begin = len(radii)
+    generate(1)
+    assert radii[0] != radii[begin]
+
+
 def test_clutter_is_seen_beside_the_object_and_covers_less_than_half_of_it():
     mesh = trimesh.creation.box((1, 2, 3))
     grey = torch.full((3, *SIZE), 0.5)

@@ -23,7 +23,7 @@ from scripts._shared import commit, read_json
 from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
-from scripts.paper.measures import bootstrap, points_within
+from scripts.paper.measures import Estimate, bootstrap, points_within
 from tests._support import write_photo
 
 SETTINGS = BankSettings(image_size=64)
@@ -315,6 +315,16 @@ def test_the_staircase_leads_from_the_paper_to_the_default_one_change_at_a_time(
         parts = [part for part in names if getattr(before, part) != getattr(after, part)]
         assert len(parts) <= 1, name
     assert replace(steps[-2][1], hypotheses=5, contours=True) == steps[-1][1]
+
+
+def test_the_staircase_shows_intervals_of_three_cads_and_what_is_known():
+    share = Estimate(0.625, 0.5, 0.75, 8)
+    scores = {2: staircase.Score(share, 2, 12.3), 0: staircase.Score(share, 3, 12.3)}
+    text = staircase.table({"lm": scores})
+    assert "| change | `lm`, N 8 |" in text
+    assert "| 2. S_rep monotone | 0.62, 12° |" in text
+    assert "| 0. the paper to the letter | 0.62 (0.50 to 0.75), 12° |" in text
+    assert "| 14. contour fit of five hypotheses: the default | - |" in text
 
 
 def climb(monkeypatch, out, *words):
