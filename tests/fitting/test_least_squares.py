@@ -50,11 +50,12 @@ def test_project_and_its_derivative():
         ([0.1, 0, 0], [0.3, 0, 0.4], 0.2),
     ],
 )
-def test_long_steps_are_shortened(rotation, translation, fraction):
-    """Translations are given as fractions of the distance of the centre, which lies half a unit
+@pytest.mark.parametrize("behind", [0.5, 4.0])
+def test_long_steps_are_shortened(rotation, translation, fraction, behind):
+    """Translations are given as fractions of the distance of the centre, which lies some units
     behind the origin."""
-    centre = double([0.0, 0.0, 0.5])
-    step = double([[*rotation, *(6.5 * t for t in translation)]])
+    centre = double([0.0, 0.0, behind])
+    step = double([[*rotation, *((6.0 + behind) * t for t in translation)]])
     found = ls.least_squares_step(eye(6)[None], step[..., None], AHEAD, centre, 0.0)
     assert_close(found, fraction * step)
 

@@ -105,9 +105,9 @@ class Scattered(Peak):
         return torch.where(far, -0.6, super().scores(views))
 
 
-def searched(*truth, camera="perspective", frame="own", kind=Peak, least_coherent=1):
+def searched(*truth, camera="perspective", frame="own", allowed=0.0, kind=Peak, least_coherent=1):
     """Error of the rotation in degrees and distance in radii that the search finds on a bank of
-    neighbours, and the matcher."""
+    neighbours, and the matcher; azimuths from ``allowed`` on are allowed."""
     mesh = trimesh.creation.box((1, 2, 3))
     pipeline = Pipeline(
         views=ViewPolicy(frame=frame), bank=BankSettings(image_size=32, camera=camera)
@@ -121,7 +121,7 @@ def searched(*truth, camera="perspective", frame="own", kind=Peak, least_coheren
     matcher = kind(bank, R, distance)
     matcher.turn = turn
     order = matcher.scores(views).argsort(descending=True, stable=True)[None]
-    matcher.ranking = SimpleNamespace(order=order, allowed=torch.ones_like(order).bool())
+    matcher.ranking = SimpleNamespace(order=order, allowed=grid.azimuth[None] >= allowed)
     rotation, found = search.search(matcher, None, matcher.ranking, least_coherent=least_coherent)
     return float(rotation_error(rotation, R)), float(found) / (0.5 * 14**0.5), matcher
 
@@ -171,6 +171,11 @@ def test_different_views_differ_in_rotation_however_little():
     order = torch.tensor([2, 4, 1, 0, 3, 5])
     assert search.different_views(rotations, order, 3).tolist() == [2, 1, 3]
     assert search.different_views(rotations, order, 9).tolist() == [2, 1, 3, 5]
+
+
+def test_search_is_between_allowed_views():
+    _, _, matcher = searched(207.0, 0.0, 3.7, allowed=240.0)
+    assert matcher.compared[0].azimuth.min() >= 240.0 - 1e-3
 
 
 def test_search_is_in_the_frame_of_the_views():

@@ -50,25 +50,25 @@ def fitted(monkeypatch, keyframes, last, shift=100.0, *, stale=False):
     """Of each step of a fit: the weights of its matches, its crop's focal length, its radius in px.
 
     Of the ``keyframes`` the second is the nearest. The flow of number k in n levels has the weight
-    10 k + n. It finds a point at (1, 1) px of the first crop, where it moves the object by
-    ``shift`` px; that is (2, 2) px of the second crop. Steps leave a pose that is not quite rigid,
-    and contours that are always, or never, ``stale``."""
+    10 k + n, finds a point on the ray (1, 1, 1), and moves the object by ``shift`` px in the first
+    crop, whose focal length is 1 px; that of the second is 2 px. Steps leave a pose that is not
+    quite rigid, and contours that are always, or never, ``stale``."""
     used = []
     problem = SimpleNamespace(
         state=lambda T: ContourState(T, T, None),
         with_current_contours=lambda state: replace(state, points="new") if stale else state,
     )
     crops = [
-        SimpleNamespace(K=double([zoom, zoom, 1.0]).diag()[None], problem=problem)
-        for zoom in (1.0, 2.0)
+        SimpleNamespace(K=double([[[f, 0, 10.0], [0, f, 10.0], [0, 0, 1]]]), problem=problem)
+        for f in (1.0, 2.0)
     ]
 
     def track(keyframe, frame, *_, levels):
-        uv = frame.K[:, :2, :2].sum(dim=1)[None]
-        return PointMatches(torch.zeros(1, 1, 3), uv, double([[10.0 * keyframe + levels]]))
+        weight = double([[10.0 * keyframe + levels]])
+        return PointMatches(torch.zeros(1, 1, 3), frame.K[:, None, :2].sum(dim=3), weight)
 
     def step(frame, state, corners, radius):
-        assert (corners.uv == frame.K[0, 0, 0]).all(), "in the crop of the step"
+        assert (corners.uv == frame.K[:, None, :2].sum(dim=3)).all(), "in the crop of the step"
         used.append((corners.weight[0].tolist(), float(frame.K[0, 0, 0]), radius))
         return state.T * double([1.01, 1.01, 1.01, 1.0])
 
