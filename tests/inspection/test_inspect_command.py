@@ -1,5 +1,6 @@
 """The command ``curvireg inspect``: its files, and what it says of bad input."""
 
+import io
 import json
 from dataclasses import replace
 
@@ -35,7 +36,10 @@ def inspect(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_report_and_page(tmp_path, capsys, inspect):
+def test_report_and_page(tmp_path, capsys, inspect, monkeypatch):
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr("sys.stderr", terminal)
     example_mesh().export(tmp_path / "truck.ply")
     code, out = inspect(tmp_path / "truck.ply", "--unit", "m", "--n", "2", "--clutter")
     assert code == 0
@@ -58,10 +62,9 @@ def test_report_and_page(tmp_path, capsys, inspect):
     assert page.count("data:image/jpeg") >= 4, "two pairs of views"
     assert page.count("<td>the first 1 of all</td>") == 1, "what four are compared with is one row"
     assert "other objects around it" in page
-    printed, shown = capsys.readouterr()
-    assert "expected: right in" in printed
-    stages = [line.split(":")[0] for line in shown.replace("\r", "\n").split("\n") if ":" in line]
-    order = ["mesh", "views", "look-alikes", "photographs"]
+    assert "expected: right in" in capsys.readouterr().out
+    stages = [line.split(":")[0] for line in terminal.getvalue().split("\r") if ":" in line]
+    order = ["reading the mesh", "rendering views", "look-alikes", "photographs"]
     assert [name for name in dict.fromkeys(stages) if name in order] == order
 
 
