@@ -285,6 +285,10 @@ REFUSED = {
         {"K": [[520, 0, 321, 5], [0, 520, 238, 0], [0, 0, 1, 0]]},
         "also moves the camera",
     ),
+    "projection by column": (
+        {"K": [[520, 0, 0, 0], [0, 520, 0, 0], [321, 238, 1, 0], [5, 0, 0, 1]]},
+        "also moves the camera",
+    ),
     "mei": (
         {"model_type": "MEI", "projection_parameters": {"gamma1": 1.0}},
         "'MEI' is not supported",

@@ -162,8 +162,7 @@ def _matrix_rows(numbers: Sequence[float]) -> list[list[float]]:
             "camera matrix: expected 3 x 3 numbers, got a projection that also moves the camera"
         )
     K = K[:3, :3]
-    is_by_column = K[2, :2].any() and not K[:2, 2].any()
-    rows: list[list[float]] = (K.T if is_by_column else K).tolist()
+    rows: list[list[float]] = (K.T if K[2, :2].any() else K).tolist()
     return rows
 
 

@@ -368,7 +368,8 @@ def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path, write, load):
 def test_faces_keep_their_side_and_convex_ones_are_fans(order, signs):
     corners = np.array([[0, 0, 0], [3, 0, 0], [4, 2, 0], [2, 4, 0], [0, 2, 0]], float)
     dart = np.array([[0, 0, 0], [1, 2, 0], [0, 1, 0], [-1, 2, 0]], float)
-    for flat, is_convex in ((corners, True), (dart, False)):
+    turned = np.roll(dart, 1, axis=0)
+    for flat, is_convex in ((corners, True), (dart, False), (turned, False)):
         tilted = (flat * [signs[0], signs[1], 1] + [[0, 0, 0.1]] * flat[:, :1])[:, list(order)]
         area = 0.5 * np.cross(tilted, np.roll(tilted, -1, axis=0)).sum(axis=0)
         faces, owner = triangulated(tilted, np.arange(len(tilted)), np.array([len(tilted)]))
