@@ -2,6 +2,7 @@
 
 import json
 import math
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import curvireg_torch as cr
 from curvireg_torch import Camera, Registration, camera_matrix
 from curvireg_torch.cli import main
 from curvireg_torch.cli.register import NONE_RELIABLE, SOME_FAILED
+from curvireg_torch.data import images
 from curvireg_torch.errors import InvalidInputError
 from tests._support import scene, write_photo
 from tests._support.exif import exif, with_exif
@@ -117,6 +119,20 @@ def lens(folder):
     cv2.imwrite(str(folder / "mask.png"), (255 * mask).round().byte().numpy())
     (folder / "cam.json").write_text(json.dumps(calibration))
     return [str(v) for v in box.tolist()], T
+
+
+def test_a_photograph_is_decoded_and_undistorted_once_for_all_meshes(
+    folder, lens, register, monkeypatch
+):
+    decode = Mock(wraps=images.decoded)
+    remap = Mock(wraps=cv2.remap)
+    monkeypatch.setattr(images, "decoded", decode)
+    monkeypatch.setattr(cv2, "remap", remap)
+    words = ["--mesh", folder / "truck.safetensors"] * 2
+    words += ["--box", *lens[0], "--camera", folder / "cam.json"]
+    assert register(folder / "distorted.png", *words) == 0
+    assert decode.call_count == 1
+    assert remap.call_count == 3  # red, green and blue
 
 
 def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, register_one, document):

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 from curvireg_torch import Registrar, rotation_error
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.mesh import mesh_radius
+from curvireg_torch.registration.rig import Rig
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 from tests._support import (
     CAMERA,
@@ -62,8 +63,23 @@ def check_pose(result, *, degrees=2.0, shift=0.1):
 
 
 @pytest.fixture(scope="module")
-def easy():
-    return registered(*rig_of(EASY))
+def fits():
+    """What the joint fits of ``easy`` began from, and the poses that they found."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def easy(fits):
+    fitted = Rig.fitted
+
+    def watched(rig, problem, T, radii):
+        found = fitted(rig, problem, T, radii)
+        fits.append((T.clone(), found[0].clone()))
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Rig, "fitted", watched)
+        return registered(*rig_of(EASY))
 
 
 def test_pose_in_the_world_and_in_each_photograph(easy):
@@ -94,6 +110,14 @@ def test_half_turns_in_doubt_are_decided_together(first, wrong, degrees):
     ]
     assert sum(error > 150 for error in errors) == wrong
     check_pose(registered(images, boxes, cameras), degrees=degrees, shift=0.2)
+
+
+@pytest.mark.usefixtures("easy")
+def test_the_joint_fit_begins_at_each_pose_and_where_a_coarse_fit_moves_it(fits):
+    """On full shelves the coarse fit moved right poses by 1 to 8 degrees."""
+    (candidates, moved), (begun, _), *_ = fits
+    assert begun.equal(torch.cat([candidates, moved]))
+    assert not moved.equal(candidates)
 
 
 def test_photographs_that_fail_are_reported_and_change_nothing(easy, tmp_path):
