@@ -111,11 +111,10 @@ class _Rows:
     def __init__(self, name: str = "", parsed: Fields | None = None) -> None:
         parsed = parsed or {"length": 0}
         data = parsed.get("data")
-        self._length: int = parsed["length"]
         self.columns: Fields = data if isinstance(data, dict) else {}
         if isinstance(data, np.ndarray):
             self.columns = {key: data[key] for key in data.dtype.names}
-        if min(map(len, self.columns.values()), default=0) < self._length:
+        if min(map(len, self.columns.values()), default=0) < parsed["length"]:
             raise ValueError(f"the file ends before the last {name}")
 
     def table(self, names: Sequence[str]) -> Floats | None:
@@ -150,10 +149,9 @@ class _Rows:
                     "binary faces with different numbers of corners are not read; export triangles"
                 )
             rows = rows["f1"]
-        if rows.dtype == object:
-            return np.concatenate([np.zeros(0), *rows]), np.array([*map(len, rows)], np.int64)
-        rows = rows.reshape(self._length, -1)  # of one row, trimesh leaves out an axis
-        return rows.reshape(-1), np.full(len(rows), rows.shape[1])
+        if rows.ndim == 2:
+            return rows.reshape(-1), np.full(len(rows), rows.shape[1])
+        return np.concatenate([np.zeros(0), *rows]), np.array([*map(len, rows)], np.int64)
 
 
 def _colours(

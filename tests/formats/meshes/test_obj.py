@@ -170,7 +170,7 @@ def test_corners_of_several_forms_in_one_file(write, load):
         ("v 1 2", "a vertex has fewer than 3 coordinates"),
         ("v 0,5 1,0 2,0", "decimal commas"),
         ("v a b c", "a coordinate is not a number"),
-        ("f 1 2 99", "a vertex that the file lacks"),
+        ("f 1 2 9", "a vertex that the file lacks"),
         ("f 1 2 -99", "a vertex that the file lacks"),
         ("f 1/9 2/9 3/9", "that the file lacks"),
         ("f 0 1 2", "vertex 0; OBJ files count from 1"),
