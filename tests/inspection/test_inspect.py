@@ -241,7 +241,6 @@ def test_upright_photographs_are_seen_from_the_side(monkeypatch):
     assert max(elevations) < 75.0
 
 
-@pytest.mark.slow
 def test_clutter_differs_from_photograph_to_photograph(monkeypatch):
     radii = []
 
@@ -257,6 +256,7 @@ def test_clutter_differs_from_photograph_to_photograph(monkeypatch):
     assert radii[0] != radii[begin]
 
 
+@pytest.mark.slow
 def test_clutter_is_seen_beside_the_object_and_covers_less_than_half_of_it():
     mesh = trimesh.creation.box((1, 2, 3))
     grey = torch.full((3, *SIZE), 0.5)

@@ -164,6 +164,23 @@ def test_a_step_follows_edges_the_end_of_the_colours_and_corners(monkeypatch):
         assert all((part != 0).any() for part in parts)
 
 
+def test_colours_are_learned_in_a_band_on_both_sides_of_the_outline(monkeypatch):
+    follow = make_tracker(cube())
+    follow.start(drawn(START), K, START)
+    found = follow.measure(drawn(START), K, START)
+    learned = []
+    monkeypatch.setattr(follow._regions, "learn", lambda *given: learned.extend(given))
+    follow.accept(found)
+    _, lines, _, inside = learned
+    silhouette = follow._silhouette(found.frame, found.state)
+    across = ((lines - silhouette.uv[:, None]) * silhouette.normals[:, None]).sum(dim=2)
+    band = [*tracking.LEARNED_BAND]
+    expected = double([*(-distance for distance in band), *band])
+    assert torch.allclose(across, expected.expand_as(across))
+    assert not inside[across > 0].any()
+    assert inside[across < 0].double().mean() > 0.9
+
+
 def test_directions_lead_from_the_centre_of_the_object():
     """Which is not that of the crop: the camera's principal point is 20 px to the left."""
     follow = make_tracker(cube())

@@ -110,6 +110,20 @@ def test_rankings_find_the_true_view(views):
 
 
 @pytest.mark.slow
+def test_the_search_says_between_how_many_views_it_searches(views):
+    for record in views:
+        for variant in tables.VARIANTS:
+            for pair in tables.PAIRS:
+                found = record[variant][pair]
+                assert 1 <= found["coherent"] <= 3
+                assert ("wider found" in found) == (pair in tables.SEARCHED_PAIRS)
+                if found["coherent"] > 1 and pair in tables.SEARCHED_PAIRS:
+                    assert found["wider found"] == found["found"]
+    (table,) = tables.search_tables(tables.Records(views, "two photographs"))
+    assert len(table.rows) == 9
+
+
+@pytest.mark.slow
 def test_chance_and_ceiling_stand_below_precision(views):
     records = tables.Records(views, "two photographs")
     precision = tables.precision_tables(records)[0]
