@@ -213,3 +213,13 @@ def test_multiscale_focus_curves_leave_weak_edges_out():
     )
     field = filters.multiscale_focus_curves(0.5 + image[None, None])[0, :, 80].norm(dim=0)
     assert (field[[30, 80, 130]] > 0).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize("angle", [0.0, 30.0, 45.0])
+def test_principal_curvature_image_points_across_a_line(angle):
+    x, y = grid(81)
+    normal = double([math.cos(math.radians(angle)), math.sin(math.radians(angle))])
+    line = 1.0 - torch.exp(-0.5 * ((normal[0] * x + normal[1] * y) / 2.0) ** 2)
+    vector = filters.principal_curvature_image(line[None, None])[0, :, 40, 40].double()
+    assert vector.norm() == pytest.approx(2.8**2 * 2 / (4 + 2.8**2) ** 1.5, rel=0.03)
+    assert abs(vector @ normal) > 0.999 * vector.norm()

@@ -249,8 +249,8 @@ def test_the_page_of_a_list_begins_with_the_surest_answers(tmp_path, monkeypatch
     pose = {"rotation": eye(3).tolist(), "translation": None, "warnings": [], "message": ""}
     pose |= {"digests": {"request": "r", "photo": "p"}, "verdict": "unsure", "reliable": False}
     rows = {
-        "unlikely": {**pose, "confidence": 0.1},
         "failed": {**pose, "verdict": "failed", "message": "no such file"},
+        "unlikely": {**pose, "confidence": 0.0},
         "likely": {**pose, "confidence": 0.95},
         "sure": {**pose, "confidence": 0.92, "reliable": True},
         "surer": {**pose, "confidence": 0.99, "reliable": True},
