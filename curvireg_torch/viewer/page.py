@@ -111,7 +111,7 @@ class Steps:
                 )
         self.messages["file"] = self._message("file")
         with region("div", "go"):
-            self.find = button("Find the pose", workspace.start_search, "register", "primary")
+            self.find = button("Find the pose", self._find, "register", "primary")
             self.stop = button("Stop", workspace.stop, "stop")
             self.bar = region(
                 "progress", "", max="1", value="0", aria_label="progress of the search"
@@ -134,6 +134,9 @@ class Steps:
 
     def _message(self, part: str) -> Any:
         return text("p", "", "message", data_testid=f"message-{part}", role="alert")
+
+    def _find(self) -> None:
+        self.workspace.start_search()  # the task outlives the page
 
     def show_messages(self) -> None:
         """Show what the workspace has to say about each part."""
