@@ -77,5 +77,6 @@ def test_a_detection_alone_agrees_with_that_of_a_batch(bank, threads, fitted):
     alone = Registrar(bank, pipeline=pipeline)(IMAGES[1:])[0]
     threads(2)
     together = Registrar(bank, pipeline=pipeline)(IMAGES)[1]
-    torch.testing.assert_close(alone.detection.boxes, together.detection.boxes)
+    boxes = alone.detection.boxes, together.detection.boxes
+    torch.testing.assert_close(*boxes, rtol=0.0, atol=1e-3)  # px
     check_agreement(alone, together)
