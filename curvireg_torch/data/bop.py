@@ -168,9 +168,10 @@ class BOPDataset(ObjectDataset):
             left_out = _no_targets(samples, counts)
             for sample in samples:
                 index = sample["instance_index"]
-                reason = "no_target" if index in left_out else "missing_image"
-                kept = reason if reason == "no_target" or image is None else sample
-                self._add(kept, f"{item} #{index}", image_path=str(image))
+                parsed = sample if image is not None else "missing_image"
+                if index in left_out:
+                    parsed = "no_target"
+                self._add(parsed, f"{item} #{index}", image_path=str(image))
         return None
 
     def _parse(self, entry: object, info: Fields, camera: object) -> Sample | str:
