@@ -173,7 +173,7 @@ class MissingDependencyError(CurviregError, ImportError):
 
 
 class WorkerError(CurviregError, RuntimeError):
-    """A process that registers photographs ended before it was done.
+    """A process that registers photographs or reads files did not start, or ended too early.
 
     Example:
         >>> issubclass(WorkerError, RuntimeError)

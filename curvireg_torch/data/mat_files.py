@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from ..errors import MAX_CAD_MEMORY, MAX_CAD_SECONDS, MAX_MAT_BYTES
+from ..errors import MAX_CAD_MEMORY, MAX_CAD_SECONDS, MAX_MAT_BYTES, WorkerError
 from ..utils.programs import run_program
 
 MatStruct = dict[str, "MatValue"]
@@ -20,7 +20,11 @@ _PROGRAM = Path(__file__).with_name("mat_values.py")
 
 def read_mats(paths: Sequence[Path], variable: str) -> Iterator[MatValue]:
     """The value of ``variable`` in each file; None if it is damaged, of another version than 5 to
-    7.2, of more than ``MAX_MAT_BYTES``, or has no such variable."""
+    7.2, of more than ``MAX_MAT_BYTES``, or has no such variable.
+
+    Raises:
+        WorkerError: SciPy does not start in a process of its own.
+    """
     names = list(map(str, paths))
     with tempfile.TemporaryDirectory() as folder:
         asked = Path(folder, "asked.json")
@@ -28,7 +32,7 @@ def read_mats(paths: Sequence[Path], variable: str) -> Iterator[MatValue]:
         while names:
             some = names[:FILES_OF_A_PROCESS]
             asked.write_text(json.dumps([variable, MAX_MAT_BYTES, *some]))
-            found.write_bytes(b"")
+            found.unlink(missing_ok=True)
             with suppress(ValueError):  # too long, or too much memory
                 run_program(
                     _PROGRAM,
@@ -37,6 +41,10 @@ def read_mats(paths: Sequence[Path], variable: str) -> Iterator[MatValue]:
                     seconds=MAX_CAD_SECONDS,
                     memory=MAX_CAD_MEMORY,
                     advice="",
+                )
+            if not found.exists():  # else each file would count as damaged
+                raise WorkerError(
+                    "SciPy, which reads MATLAB files in a process of its own, does not start there"
                 )
             lines = found.read_bytes().splitlines(keepends=True)
             values = [json.loads(line) for line in lines if line.endswith(b"\n")]

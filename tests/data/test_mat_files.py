@@ -7,9 +7,10 @@ import pytest
 import scipy.io
 
 from curvireg_torch.data.mat_files import read_mats
-from curvireg_torch.errors import MAX_MAT_BYTES
+from curvireg_torch.errors import MAX_MAT_BYTES, WorkerError
 from tests._support.matlab import element, file
 from tests._support.miniature import pascal_object, write_record
+from tests._support.refusals import refused
 
 
 def array(array_class, dims, rest, name=b"record"):
@@ -80,6 +81,15 @@ def test_files_that_end_the_process_or_take_its_memory_cost_no_others(tmp_path):
     values = list(read_mats([*paths, tmp_path / "nothing.mat"], "record"))
     assert [value is None for value in values] == [True, False] * len(contents) + [True]
     assert json.dumps(values[1]).count("a") == 10
+
+
+def test_no_file_counts_as_damaged_where_scipy_does_not_start(tmp_path, monkeypatch):
+    write_record(tmp_path / "a.mat", [pascal_object("car")])
+    program = tmp_path / "program.py"
+    program.write_text("import no_scipy")
+    monkeypatch.setattr("curvireg_torch.data.mat_files._PROGRAM", program)
+    with refused("SciPy, .* does not start", WorkerError):
+        read(tmp_path / "a.mat")
 
 
 def test_damaged_files_have_a_value_or_none(tmp_path):
