@@ -12,6 +12,7 @@ import csv
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from sklearn.metrics import roc_auc_score
@@ -29,26 +30,6 @@ from scripts._shared import (
 
 RIGHT = 30.0  # degrees
 ERROR_COLUMNS = ("rotation", "symmetric_error_deg")  # of BOP sets and of PASCAL3D+
-HEADER = (
-    "set",
-    "N",
-    "mean confidence",
-    "right",
-    "reliable",
-    "of these right",
-    "ambiguous",
-    "AUC",
-)
-GENERATED_HEADER = (
-    "photographs",
-    "N",
-    "mean confidence",
-    "right",
-    "reliable",
-    "wrong of these",
-    "AUC",
-)
-WITHHELD_HEADER = ("set", "N", "within 5°: given, none", "within 15°", "median")
 # by the name of their set in scripts/calibration
 GENERATED = {
     "shelves": "on full shelves, half of them grey",
@@ -91,8 +72,7 @@ def merged(
 ) -> list[Mapping[str, Any]]:
     """The stored rows, of which new ones of the same name take the place, then the other new
     ones."""
-    of_name = {row["name"]: row for row in stored} | {row["name"]: row for row in rows}
-    return list(of_name.values())
+    return list({row["name"]: row for row in [*stored, *rows]}.values())
 
 
 def measured(run: Path) -> dict[str, Any]:
@@ -103,27 +83,20 @@ def measured(run: Path) -> dict[str, Any]:
     with (run / "errors.csv").open(encoding="utf-8", newline="") as file:
         errors = list(csv.DictReader(file))
     column = next(name for name in ERROR_COLUMNS if name in errors[0])
-    confidences = []
-    right = []
-    reliable = []
-    ambiguous = 0
-    for row in errors:
-        result = results[row["key"]]
-        confidences.append(result.get("confidence") or 0.0)
-        right.append(bool(row[column]) and float(row[column]) < RIGHT)
-        reliable.append(bool(result.get("reliable")))
-        ambiguous += result.get("ambiguous") is not None
+    found = [results[row["key"]] for row in errors]
+    confidences = [result.get("confidence") or 0.0 for result in found]
+    right = [float(row[column] or "inf") < RIGHT for row in errors]
     trusted = [
-        is_right for is_right, is_reliable in zip(right, reliable, strict=True) if is_reliable
+        is_right for is_right, result in zip(right, found, strict=True) if result.get("reliable")
     ]
     return {
         "name": run.name,
         "n": len(errors),
-        "mean_confidence": sum(confidences) / len(errors),
-        "right": sum(right) / len(errors),
+        "mean_confidence": fmean(confidences),
+        "right": fmean(right),
         "reliable": len(trusted),
         "reliable_right": sum(trusted),
-        "ambiguous": ambiguous,
+        "ambiguous": sum(result.get("ambiguous") is not None for result in found),
         "auc": float(roc_auc_score(right, confidences)) if len(set(right)) == 2 else None,
     }
 
@@ -154,35 +127,42 @@ def generated_part(calibration: Mapping[str, Any]) -> str:
 
 def table_of_generated(sets: Mapping[str, dict[str, Any]]) -> str:
     """Markdown, of the quality of confidences by set of generated photographs."""
-    cells = [list(GENERATED_HEADER)]
+    header = "photographs | N | mean confidence | right | reliable | wrong of these | AUC"
+    cells = [header.split(" | ")]
     for name, photographs in GENERATED.items():
         one = sets[name]
-        auc = "" if one["auc"] is None else f"{one['auc']:.2f}"
-        shares = [f"{one[key]:.2f}" for key in ("said", "right", "reliable")]
-        cells.append([photographs, str(one["n"]), *shares, str(one["reliable and wrong"]), auc])
-    return "\n".join(table_lines(cells)) + "\n"
+        shares = [share(one[key]) for key in ("said", "right", "reliable")]
+        wrong = str(one["reliable and wrong"])
+        cells.append([photographs, str(one["n"]), *shares, wrong, share(one["auc"])])
+    return "\n".join([*table_lines(cells), ""])
 
 
 def table_of_withheld(sets: Mapping[str, dict[str, Any]]) -> str:
     """Markdown, of the same generated photographs with their cameras and without."""
-    cells = [list(WITHHELD_HEADER)]
+    cells = [["set", "N", "within 5°: given, none", "within 15°", "median"]]
     for name in ("shapes", "packages"):
         both = (sets[name], sets[f"estimated_{name}"])
-        pairs = [[f"{one[f'within {angle}']:.2f}" for one in both] for angle in (5, 15)]
-        pairs.append([f"{one['median']:.1f}°" for one in both])
-        cells.append([name, str(sets[name]["n"]), *(", ".join(pair) for pair in pairs)])
-    return "\n".join(table_lines(cells)) + "\n"
+        row = [name, str(sets[name]["n"])]
+        for key in ("within 5", "within 15"):
+            row.append(", ".join(share(one[key]) for one in both))
+        row.append(", ".join(f"{one['median']:.1f}°" for one in both))
+        cells.append(row)
+    return "\n".join([*table_lines(cells), ""])
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Markdown."""
-    cells = [list(HEADER)]
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown, of the quality of confidences by real set."""
+    header = "set | N | mean confidence | right | reliable | of these right | ambiguous | AUC"
+    cells = [header.split(" | ")]
     for row in rows:
-        auc = "" if row["auc"] is None else f"{row['auc']:.2f}"
-        shares = [f"{row[name]:.2f}" for name in ("mean_confidence", "right")]
+        shares = [share(row[name]) for name in ("mean_confidence", "right")]
         counts = [str(row[name]) for name in ("reliable", "reliable_right", "ambiguous")]
-        cells.append([f"`{row['name']}`", str(row["n"]), *shares, *counts, auc])
-    return "\n".join(table_lines(cells)) + "\n"
+        cells.append([f"`{row['name']}`", str(row["n"]), *shares, *counts, share(row["auc"])])
+    return "\n".join([*table_lines(cells), ""])
+
+
+def share(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
 
 
 if __name__ == "__main__":
