@@ -30,24 +30,19 @@ TOGETHER = (1, 8, 64)  # photographs in one call
 Record = dict[str, Any]
 
 
-def seconds_of(function: Callable[[], object], device: str) -> float:
-    """Of one call, until the device has finished."""
-    finish(device)
+def rate(function: Callable[[], object], count: int) -> Record:
+    """Seconds of a call with ``count`` photographs, until the device has finished."""
+    finish()
     start = time.perf_counter()
     function()
-    finish(device)
-    return time.perf_counter() - start
-
-
-def finish(device: str) -> None:
-    if device != "cpu":
-        torch.cuda.synchronize(device)
-
-
-def rate(function: Callable[[], object], count: int, device: str) -> Record:
-    """Seconds of a call with ``count`` photographs."""
-    seconds = seconds_of(function, device)
+    finish()
+    seconds = time.perf_counter() - start
     return {"seconds": seconds, "photographs_per_second": count / seconds}
+
+
+def finish() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
 
 
 def degrees(results: Any, others: Sequence[Tensor | None]) -> list[float | None]:
@@ -75,12 +70,12 @@ def measure(
         return cr.ViewBank.build(mesh, views, progress=False, device=device)
 
     bank = build()  # kernels are loaded
-    record("bank", {"seconds": seconds_of(build, device), "views": len(bank)})
+    record("bank", {"seconds": rate(build, 1)["seconds"], "views": len(bank)})
 
     matcher = ViewMatcher(bank)
     matcher(others.images, others.boxes)
     matcher(new.images, new.boxes)  # describes the views that it needs
-    record("rank", rate(lambda: matcher(new.images, new.boxes), count, device))
+    record("rank", rate(lambda: matcher(new.images, new.boxes), count))
 
     registrar = cr.Registrar(matcher)
 
@@ -88,19 +83,18 @@ def measure(
         return registrar(some.images[first:last], some.boxes[first:last], some.K)
 
     register(others, 0, count)
-    record("new", rate(lambda: register(new, 0, count), count, device))
+    record("new", rate(lambda: register(new, 0, count), count))
     for together in TOGETHER:
         number = min(together, count)
         register(new, 0, number)
-        measured = rate(lambda n=number: register(new, 0, n), number, device)
-        record(f"register_{together}", measured)
+        record(f"register_{together}", rate(lambda n=number: register(new, 0, n), number))
     results = register(new, 0, count)
     errors = degrees(results, [pose[:3, :3] for pose in new.poses])
-    within = {
-        f"within_{limit}": sum(error is not None and error < limit for error in errors) / count
-        for limit in (5, 15)
-    }
-    record("accuracy", within)
+    accuracy = {}
+    for limit in (5, 15):
+        right = sum(error is not None and error < limit for error in errors)
+        accuracy[f"within_{limit}"] = right / count
+    record("accuracy", accuracy)
     few = min(AGREE, count)
     alone = [register(new, k, k + 1)[0] for k in range(few)]
     record("degrees_alone_and_together", degrees(alone, rotations(results[:few])))
@@ -113,12 +107,14 @@ def measure(
     boxes = torch.cat([new.boxes[:half], of_truck.boxes[half:]])
     found = two(images, boxes, new.K)
     right = [result.ok and result.mesh_index == (k >= half) for k, result in enumerate(found)]
-    measured = rate(lambda: two(images, boxes, new.K), count, device)
+    measured = rate(lambda: two(images, boxes, new.K), count)
     record("two_meshes", {**measured, "right_mesh": sum(right) / count})
 
     on_cpu = cr.Registrar(bank.to("cpu"))
-    expected = on_cpu(new.images[:few], new.boxes[:few], new.K)
-    record("cpu", rate(lambda: on_cpu(new.images[:few], new.boxes[:few], new.K), few, "cpu"))
+    images = new.images[:few]
+    boxes = new.boxes[:few]
+    expected = on_cpu(images, boxes, new.K)
+    record("cpu", rate(lambda: on_cpu(images, boxes, new.K), few))
     errors = degrees(results[:few], rotations(expected))
     known = [error for error in errors if error is not None]
     record("degrees_from_cpu", {"each": errors, "median": statistics.median(known or [180.0])})

@@ -2,28 +2,22 @@
 
     python scripts/speed/speed.py                                # this checkout alone
     git worktree add ../before HEAD~20
-    python scripts/speed/speed.py --against ../before            # A B A B, with the ratio of each
-    step python scripts/speed/speed.py --device cuda --steps bank one many layers --out gpu.json
+    python scripts/speed/speed.py --against ../before            # A B A B, with each step's ratio
 
-Writes scripts/results/speed.json and, without --out, the table of docs/performance.md. Every
-measurement has a process of its own; each step counts with its least time and memory over the
-rounds. Ratios are fair on a busy machine, times only on an idle one. The other checkout is of
-2026-11-23 or later.
+Writes scripts/results/speed.json and the table of docs/performance.md. Every measurement has a
+process of its own; each step counts with its least time and memory over the rounds. Ratios are fair
+on a busy machine, times only on an idle one. The other checkout is of 2026-11-23 or later.
 
 New photographs were never registered with the cache in use: what a first registration describes may
 not be kept for the second. An earlier command has registered ten others of the same mesh, but for
-``cold`` and ``fresh``.
+``fresh``.
 
-- cold, warm: ``curvireg register`` from process start to its files, a new photograph, without and
-  with a cached bank
+- warm: ``curvireg register`` from process start to its files, a new photograph, with a cached bank
 - bank: ``ViewBank.build`` of all views
-- rank: a new photograph without contour fit
 - fresh: each of the first ten photographs of a mesh whose bank is cached, one by one
 - one: a new photograph; repeated: the same photograph again; many: each of many new photographs in
   one call
 - follow: each frame of a video in which the photograph moves by 2 px
-- layers: forward and backward pass of three filter layers, each followed by HOG; a photograph of a
-  batch
 """
 
 import json
@@ -39,7 +33,7 @@ from typing import Any
 from scripts import _shared
 
 ROOT = Path(__file__).resolve().parents[2]
-STEPS = ("cold", "warm", "bank", "rank", "fresh", "one", "repeated", "many", "follow", "layers")
+STEPS = ("warm", "bank", "fresh", "one", "repeated", "many", "follow")
 FRAMES = 12
 EARLIER = 10  # photographs that an earlier command registered
 NEW = 4  # new photographs of the steps that register one after another
@@ -99,53 +93,21 @@ def write_inputs(folder: str, photographs: int) -> None:
     _shared.write_json(Path(folder, "boxes.json"), generated.boxes.tolist())
 
 
-def measure_layers(photographs: int, device: str) -> float:
-    """Seconds of a forward and backward pass of three filter layers, each followed by HOG, for one
-    of a batch."""
-    import torch
-
-    import curvireg_torch as cr
-
-    layers = [
-        cr.ImageCurvilinearSaliency(),
-        cr.MultiScaleCurvilinearSaliency(),
-        cr.MultiScaleFocusCurves(),
-    ]
-    hog = cr.HOG().to(device)
-    images = torch.rand(photographs, 1, 480, 640, generator=torch.Generator().manual_seed(0)).to(
-        device
-    )
-    seconds = []
-    for _ in range(3):
-        start = time.perf_counter()
-        for layer in layers:
-            pixels = images.clone().requires_grad_()
-            hog(layer.to(device)(pixels)).sum().backward()
-            assert pixels.grad.isfinite().all()  # waits for a GPU
-        seconds.append(time.perf_counter() - start)
-    return min(seconds) / photographs
-
-
-def measure(step: str, folder: str, photographs: int, device: str) -> dict[str, float]:
+def measure(step: str, folder: str, photographs: int) -> dict[str, float]:
     """Wall and processor seconds of a step in whichever checkout this process imports."""
-    from dataclasses import replace
-
     import torch
 
     import curvireg_torch as cr
 
-    if step == "layers":
-        return {"seconds": measure_layers(photographs, device)}
     mesh = cr.load_mesh(Path(folder, "mesh.ply"))
-    K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
     if step == "bank":
         watch = Stopwatch()
-        cr.ViewBank.build(mesh, progress=False, device=device)
+        cr.ViewBank.build(mesh, progress=False)
         return watch.seconds(1)
+    K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
     paths = [str(Path(folder, f"photo{k}.png")) for k in range(EARLIER + photographs)]
     boxes = torch.tensor(_shared.read_json(Path(folder, "boxes.json")))
-    pipeline = replace(cr.Pipeline(), contours=step != "rank")
-    registrar = cr.Registrar(mesh, pipeline=pipeline, device=device, progress=False)
+    registrar = cr.Registrar(mesh, progress=False)
     if step == "follow":
         from curvireg_torch.data import read_image
         from curvireg_torch.registration import Follower
@@ -169,20 +131,17 @@ def measure(step: str, folder: str, photographs: int, device: str) -> dict[str, 
         register(earlier)
         return {"seconds": 0.0}
     if step == "fresh":
-        one_by_one = earlier
+        calls = [[k] for k in earlier]
     else:
         register(earlier[:1])  # loads what every later photograph shares
-        one_by_one = new[:NEW]
+        calls = [list(new)] if step == "many" else [[k] for k in new[:NEW]]
     if step == "repeated":
-        for k in one_by_one:
-            register([k])
+        for call in calls:
+            register(call)
     watch = Stopwatch()
-    if step == "many":
-        register(new)
-        return watch.seconds(len(new))
-    for k in one_by_one:
-        register([k])
-    return watch.seconds(len(one_by_one))
+    for call in calls:
+        register(call)
+    return watch.seconds(sum(map(len, calls)))
 
 
 class Stopwatch:
@@ -200,18 +159,15 @@ class Stopwatch:
 
 
 def measured(
-    step: str, checkout: Path, folder: Path, cache: Path, photographs: int, device: str
+    step: str, checkout: Path, folder: Path, cache: Path, photographs: int
 ) -> dict[str, float]:
     """Seconds, processor seconds and MB of a step in a checkout."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "CURVIREG_CACHE": str(cache)}
     # modules are compiled in the first round alone, as after an installation
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    if step not in ("cold", "warm"):
-        words = [
-            "-c",
-            f"{HERE}; import json; print(json.dumps(measure({step!r}, {str(folder)!r}, "
-            f"{photographs}, {device!r})))",
-        ]
+    if step != "warm":
+        call = f"measure({step!r}, {str(folder)!r}, {photographs})"
+        words = ["-c", f"{HERE}; import json; print(json.dumps({call}))"]
         _, usage, output = _shared.run_process(words, folder, environment)
         return {**json.loads(output.splitlines()[-1]), "megabytes": usage.ru_maxrss / 1024}
     # another checkout refuses to replace files that it did not write
@@ -225,34 +181,30 @@ def measured(
 
 
 def compare(
-    checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int, device: str
-) -> Any:
+    checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int
+) -> dict[str, dict[str, Any]]:
     """Least seconds and megabytes of each step in each checkout, measured in turn."""
     found = {name: {} for name in checkouts}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        _shared.run_process(
-            ["-c", f"{HERE}; write_inputs({temporary!r}, {photographs})"], folder, environment
-        )
+        command = f"{HERE}; write_inputs({temporary!r}, {photographs})"
+        _shared.run_process(["-c", command], folder, environment)
         for name, checkout in checkouts.items():
             bank_alone = folder / f"{name}-bank"
-            measured("follow", checkout, folder, bank_alone, photographs, device)  # stores the bank
+            measured("follow", checkout, folder, bank_alone, photographs)  # stores the bank
             for features in bank_alone.glob("banks/views-*"):
                 features.unlink()
             used = folder / f"{name}-used"
             shutil.copytree(bank_alone, used)
-            measured("earlier", checkout, folder, used, photographs, device)
+            measured("earlier", checkout, folder, used, photographs)
         for step in tuple(steps) * rounds:
             for name, checkout in checkouts.items():
                 # a copy for each measurement: what this one stores, the next one lacks
                 cache = folder / "cache"
-                if step != "cold":
-                    shutil.copytree(
-                        folder / f"{name}-{'bank' if step == 'fresh' else 'used'}", cache
-                    )
-                new = measured(step, checkout, folder, cache, photographs, device)
-                shutil.rmtree(cache, ignore_errors=True)
+                shutil.copytree(folder / f"{name}-{'bank' if step == 'fresh' else 'used'}", cache)
+                new = measured(step, checkout, folder, cache, photographs)
+                shutil.rmtree(cache)
                 print(f"{step}, {name}: {cell(new)}", file=sys.stderr)
                 old = found[name].get(step, new)
                 found[name][step] = {key: min(old[key], value) for key, value in new.items()}
@@ -267,8 +219,7 @@ def table(record: dict[str, Any]) -> str:
     rows = [["step", *columns, "ratio of processor times"]]
     for step in times["now"]:
         measurements = [steps[step] for steps in times.values()]
-        key = "processor_seconds" if "processor_seconds" in measurements[-1] else "seconds"
-        ratio = measurements[-1][key] / measurements[0][key]
+        ratio = measurements[-1]["processor_seconds"] / measurements[0]["processor_seconds"]
         rows.append([f"`{step}`", *map(cell, measurements), f"{ratio:.2f}"])
     if len(times) == 1:
         rows = [row[:-1] for row in rows]
@@ -279,41 +230,30 @@ def table(record: dict[str, Any]) -> str:
 
 def cell(measurement: dict[str, float]) -> str:
     """Seconds, processor seconds and memory of a step."""
-    processor = measurement.get("processor_seconds")
-    also = "" if processor is None else f" ({processor:.2f})"
-    return f"{measurement['seconds']:.2f} s{also}, {measurement['megabytes']:.0f} MB"
+    return "{seconds:.2f} s ({processor_seconds:.2f}), {megabytes:.0f} MB".format(**measurement)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     parser = _shared.parser_of(__doc__)
     parser.add_argument(
         "--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository"
     )
     parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS)
     parser.add_argument("--photographs", type=int, default=16)
-    parser.add_argument(
-        "--device", default="cpu", help="of all steps but the commands (default cpu)"
-    )
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument(
-        "--out", type=Path, help="another file than scripts/results/speed.json; no page is changed"
-    )
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     checkouts = {"before": options.against.resolve()} if options.against else {}
     checkouts["now"] = ROOT
     record = {
         "date": _shared.today(),
         "commits": {name: _shared.commit(root) for name, root in checkouts.items()},
-        "processor": _shared.processor(options.device),
+        "processor": _shared.processor(),
         "photographs": options.photographs,
-        "times": compare(
-            checkouts, options.steps, options.photographs, options.rounds, options.device
-        ),
+        "times": compare(checkouts, options.steps, options.photographs, options.rounds),
     }
-    _shared.write_json(options.out or _shared.RESULTS / "speed.json", record)
+    _shared.write_json(_shared.RESULTS / "speed.json", record)
+    _shared.update_page(_shared.REPOSITORY / "docs" / "performance.md", "speed", table(record))
     print(table(record))
-    if options.out is None:
-        _shared.update_page(_shared.REPOSITORY / "docs" / "performance.md", "speed", table(record))
 
 
 if __name__ == "__main__":
