@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from curvireg_torch.registration.confidence import RELIABLE
@@ -31,42 +32,30 @@ LEVELS = (0.5, 0.9)  # of ellipsoids whose coverage is measured
 CONSTANTS = REPOSITORY / "curvireg_torch" / "calibration" / "calibration.json"
 
 
-def calibrate(
-    work: Path,
-    jobs: int,
-    limit: int | None,
-    models: Sequence[str],
-    meshes: Path | None,
-    *,
-    level: bool = False,
-) -> tuple[Row, Row]:
+def calibrate(work: Path, jobs: int, models: Sequence[str], meshes: Path | None) -> tuple[Row, Row]:
     """Constants, those of other ``models`` as they were, and quality of the new ones on held-out
     kinds of objects."""
     constants: Row = read_json(CONSTANTS)
     quality: Row = {}
     for name in models:
         if name in KINDS:
-            rows = rows_of(work, KINDS[name], jobs, limit)
+            rows = rows_of(work, KINDS[name], jobs)
             constants[name] = fit_logistic(rows, np.ones(len(rows)), {})
             continue
-        rows = [
-            row for chosen in sets_of([name], meshes) for row in rows_of(work, chosen, jobs, limit)
-        ]
-        constants[name], quality[name] = fit_registrations(
-            rows, exact=name == "instance", present=constants[name] if level else None
-        )
+        rows = [row for chosen in sets_of([name], meshes) for row in rows_of(work, chosen, jobs)]
+        constants[name], quality[name] = fit_registrations(rows, exact=name == "instance")
         sure = [row for row in rows if first_probability(row, constants[name]) >= RELIABLE]
-        unique = [row for row in sure if row["first"] and "distance2" in row]
-        if unique:
-            distances = np.array([row["distance2"] for row in unique])
+        distances = [row["distance2"] for row in sure if row["first"] and "distance2" in row]
+        if distances:
             quality[name] |= covariance_quality(distances, constants["covariance_scale"])
     return constants, quality
 
 
-def covariance_quality(distances: np.ndarray, scale: float) -> Row:
+def covariance_quality(distances: ArrayLike, scale: float) -> Row:
     """What covariances are worth, from squared Mahalanobis distances (n,) of reliable and right
     poses to the truth: shares within the ellipsoids of 50 % and 90 %, and the ``covariance_scale``
     with which 90 % would lie within the latter."""
+    distances = np.asarray(distances)
     within = {f"{level:.0%}": float((distances < chi2.ppf(level, 6)).mean()) for level in LEVELS}
     wanted = scale * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
     return {
@@ -82,25 +71,11 @@ def main() -> None:
     parser.add_argument("--meshes", type=Path, help="folder of scripts/benchmark/meshes.py")
     parser.add_argument("--count", type=int, default=400, help="photographs of each set")
     parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
-    parser.add_argument("--limit", type=int, help="photographs to measure, fewer than there are")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument(
-        "--level", action="store_true", help="few photographs: fit scale and level alone"
-    )
-    parser.add_argument("--render", action="store_true", help="render the sets only")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     render_sets(options.work, options.meshes, options.count, options.jobs, options.models)
-    if options.render:
-        return
-    constants, quality = calibrate(
-        options.work,
-        options.jobs,
-        options.limit,
-        options.models,
-        options.meshes,
-        level=options.level,
-    )
+    constants, quality = calibrate(options.work, options.jobs, options.models, options.meshes)
     record = stamp() | {"constants": constants, "held out": quality}
     print(json.dumps(record, indent=2))
     if options.write:

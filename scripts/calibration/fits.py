@@ -1,6 +1,7 @@
 """Fits of confidences to measured rows, and how well they tell what is right."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
@@ -48,9 +49,8 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
 
     def loss(p: np.ndarray) -> tuple[float, np.ndarray]:
         logit = Z @ p[:-1] + p[-1]
-        value = float(weight @ (np.logaddexp(0.0, logit) - y * logit)) + 0.5 * float(
-            p[:-1] @ p[:-1]
-        )
+        prior = 0.5 * float(p[:-1] @ p[:-1])
+        value = float(weight @ (np.logaddexp(0.0, logit) - y * logit)) + prior
         slope = weight * (expit(logit) - y)
         return value, np.append(Z.T @ slope + p[:-1], slope.sum())
 
@@ -105,10 +105,8 @@ def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
     def loss(slope: float, resolution: float) -> float:
         logits = -slope * np.maximum(0.0, behind - resolution)
         of_right = np.where(right, logits, -np.inf)
-        return float(
-            weight[decided] @ (logsumexp(logits, axis=1) - logsumexp(of_right, axis=1))
-            + 0.05 * slope**2
-        )
+        losses = logsumexp(logits, axis=1) - logsumexp(of_right, axis=1)
+        return float(weight[decided] @ losses + 0.05 * slope**2)
 
     found = []
     for resolution in RESOLUTIONS if ties else (0.0,):
@@ -135,21 +133,20 @@ def first_share(row: Row, constants: Row) -> float:
 def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
     """How well probabilities (n,) tell the right answers (n,) bool."""
     sure = p >= RELIABLE
-    quality: Row = {"n": len(p), "right": float(np.average(right, weights=weight))}
-    quality |= {
-        "said": float(np.average(p, weights=weight)),
-        "reliable": float(np.average(sure, weights=weight)),
+
+    def mean(values: np.ndarray, chosen: Any = slice(None)) -> float:
+        return float(np.average(values[chosen], weights=weight[chosen]))
+
+    both = len(np.unique(right)) == 2
+    return {
+        "n": len(p),
+        "right": mean(right),
+        "said": mean(p),
+        "reliable": mean(sure),
+        "auc": float(roc_auc_score(right, p, sample_weight=weight)) if both else None,
+        "right if reliable": mean(right, sure) if sure.any() else None,
+        "reliable and wrong": int((sure & ~right).sum()),
     }
-    quality["auc"] = (
-        float(roc_auc_score(right, p, sample_weight=weight))
-        if len(set(right.tolist())) == 2
-        else None
-    )
-    quality["right if reliable"] = (
-        float(np.average(right[sure], weights=weight[sure])) if sure.any() else None
-    )
-    quality["reliable and wrong"] = int((sure & ~right).sum())
-    return quality
 
 
 def errors_within(errors: np.ndarray) -> Row:
@@ -158,31 +155,35 @@ def errors_within(errors: np.ndarray) -> Row:
     return within | {"median": float(np.median(errors))}
 
 
-def fit_registrations(
-    rows: list[Row], *, exact: bool, present: Row | None = None
-) -> tuple[Row, Row]:
+def weights_of(sets: np.ndarray) -> np.ndarray:
+    """(n,) weights of rows by their sets, with which sets of ``SHARES`` have these shares of all
+    photographs."""
+    weight = np.ones(len(sets))
+    assumed = {name: SHARES[name] for name in np.unique(sets) if name in SHARES}
+    ordinary = float((~np.isin(sets, list(assumed))).sum())
+    factor = ordinary / (1.0 - sum(assumed.values()))
+    for name, share in assumed.items():
+        weight[sets == name] = factor * share / (sets == name).sum()
+    return weight
+
+
+def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
     """Constants of a model of registrations, and their quality on held-out folds, in all and by
-    set. With the ``present`` constants only their scale and level are fitted, see
-    :func:`fit_level`."""
+    set."""
     for row in rows:
         is_present = row["set"] not in ABSENT
         row["right"] = is_present and min(row["errors"]) < RIGHT
         row["first"] = is_present and row["errors"][0] < RIGHT
     sets = np.array([row["set"] for row in rows])
-    ordinary = float(sum(name not in SHARES for name in sets))
-    factor = ordinary / (1.0 - sum(SHARES[name] for name in set(sets) if name in SHARES))
-    weight = np.array(
-        [factor * SHARES[name] / (sets == name).sum() if name in SHARES else 1.0 for name in sets]
-    )
+    weight = weights_of(sets)
     signs = dict.fromkeys(EVIDENCE_FEATURES, 1.0) | dict.fromkeys(DOUBT_FEATURES, -1.0)
 
     def fit(train: np.ndarray) -> Row:
         # what fits, but is less probable than the mirror image, tells nothing of what fits
         train = train & ~is_mirrored
-        some = [row for row, chosen in zip(rows, train, strict=True) if chosen]
-        fitted = present or fit_logistic(some, weight[train], signs) | fit_shares(
-            some, weight[train], ties=exact
-        )
+        some = [rows[k] for k in np.flatnonzero(train)]
+        fitted = fit_logistic(some, weight[train], signs)
+        fitted |= fit_shares(some, weight[train], ties=exact)
         return fit_level(some, weight[train], fitted)
 
     is_mirrored = np.array([row.get("mirror", False) for row in rows])
@@ -190,11 +191,8 @@ def fit_registrations(
     p = np.zeros(len(rows))
     for k in range(FOLDS):
         constants = fit(fold != k)
-        p[fold == k] = [
-            first_probability(row, constants)
-            for row, own in zip(rows, fold == k, strict=True)
-            if own
-        ]
+        for held_out in np.flatnonzero(fold == k):
+            p[held_out] = first_probability(rows[held_out], constants)
     first = np.array([row["first"] for row in rows])
     quality = quality_of(p, first, weight)
     by_set = {name: sets == name for name in dict.fromkeys(sets.tolist())}

@@ -4,13 +4,11 @@ whether it is true: a row for each."""
 import json
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from itertools import groupby
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -25,7 +23,7 @@ from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis
 from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
 from curvireg_torch.mesh import Mesh
-from curvireg_torch.registration import Follower, camera, judging
+from curvireg_torch.registration import Follower, judging
 from curvireg_torch.registration.confidence import are_near
 from scripts._shared import read_json
 from scripts.calibration.sets import ESTIMATED, GREY, MODELS, SETS, UPRIGHT, photographs_of
@@ -89,77 +87,36 @@ def fine(T: Tensor, sample: Row) -> bool:
 def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> Iterator[Row]:
     """One row: features, scores and errors of the hypotheses."""
     K = sample["camera_matrix"].double() if with_camera else None
-    with recorded_gaps() as gaps:
-        result = registrar([sample["image"]], sample["box"][None], K)[0]
+    result = registrar([sample["image"]], sample["box"][None], K)[0]
     if not result.ok:
         return
+    best = result.hypotheses[0]
     seen = sample
-    R = torch.stack(
-        [h.rotation if K is not None else h.allocentric_rotation for h in result.hypotheses]
-    )
-    if K is None:  # compare as seen by a camera that looks straight at the object
+    if with_camera:
+        R = torch.stack([h.rotation for h in result.hypotheses])
+    else:  # compare as seen by a camera that looks straight at the object
+        R = torch.stack([h.allocentric_rotation for h in result.hypotheses])
         straight = cr.geometry.rotation_towards(true_centre(sample))
         seen = sample | {"rotation": straight.T @ sample["rotation"].double()}
     evidence = Evidence.of_hypotheses([h.evidence for h in result.hypotheses])
     scores = evidence.scores(registrar.score_weights(exact=registrar.is_exact))
     S = symmetries_of(sample, registrar if registrar.is_exact else None)
+    errors = errors_of(R, seen, S)
     # near the best one up to symmetries, they are right if it is
     is_rival = ~are_near(R.float(), R[0].float(), S)
     is_rival[0] = True
-    row = {"features": dict(result.confidence_features), "scores": scores[is_rival].tolist()}
-    row |= {"evidence": evidence.table[is_rival].tolist()}
-    errors = errors_of(R, seen, S)
-    row |= {"errors": errors[is_rival].tolist()}
-    row |= {"mirror": judging.MIRROR_WARNING in result.warnings}
-    best = result.hypotheses[0]
+    row = {
+        "features": dict(result.confidence_features),
+        "scores": scores[is_rival].tolist(),
+        "errors": errors[is_rival].tolist(),
+        "mirror": judging.MIRROR_WARNING in result.warnings,
+    }
     is_unique = len(S) == 1  # else the covariance is that of another pose
-    if gaps:  # logarithm of the shown focal length over the given one, and its deviation
-        row["focal gap"] = gaps[0]
-    row |= groups_of(result, registrar, seen["rotation"].double() @ R[0].T, errors)
-    if best.covariance is not None and is_unique and row["errors"][0] < RIGHT:
-        if (said := best.exactness) is not None:
-            distance = best.distance / float(true_centre(sample).norm())
-            turned = said.rotation_deg if K is not None else said.allocentric_deg
-            row["errors in radii"] = [row["errors"][0] / turned]
-            row["errors in radii"] += [100.0 * abs(distance - 1.0) / said.distance_percent]
+    if best.covariance is not None and is_unique and errors[0] < RIGHT:
         turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
         e = torch.cat([turn, sample["translation"].double() - best.translation])
         row["distance2"] = float(e @ torch.linalg.solve(best.covariance.double(), e))
     yield row
-
-
-@contextmanager
-def recorded_gaps() -> Iterator[list[tuple[float, float]]]:
-    """By how much photographs contradict their focal lengths, with standard deviations, of the
-    registrations within."""
-    gaps = []
-    judge = camera.focal_contradiction
-
-    def recording(focal: float, gap: float, deviation: float, **more: float) -> str | None:
-        if np.isfinite(deviation):
-            gaps.append((gap, deviation))
-        return judge(focal, gap, deviation, **more)
-
-    with patch.object(camera, "focal_contradiction", recording):
-        yield gaps
-
-
-def groups_of(
-    result: cr.Registration, registrar: cr.Registrar, turn: Tensor, errors: Tensor
-) -> Row:
-    """What is said of the first two rivals of a result, and whether one of them is right; the like
-    of its axis. ``turn`` (3, 3) leads from the first hypothesis to the truth; ``errors`` (N,) in
-    degrees are those of all."""
-    row: Row = {}
-    if result.pair_probability is not None:
-        rivals = [k for k, p in enumerate(result.probabilities) if p > 0.0][:2]
-        row["pair"] = [result.pair_probability, bool((errors[rivals] < RIGHT).any())]
-    if result.axis is not None and registrar.round_axis is not None:
-        cosine = float(turn @ result.axis.direction @ result.axis.direction)
-        cosine = abs(cosine) if registrar.round_axis.ends_are_alike else cosine
-        degrees = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-        row["axis"] = [result.axis.probability, degrees <= result.axis.tolerance_deg]
-    return row
 
 
 def true_centre(sample: Row) -> Tensor:
@@ -212,20 +169,22 @@ def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
     """Rows of detections without a box, in a photograph of the object and in one without it."""
     for shown in (sample, other):
         result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
-        lost = not result.ok and isinstance(result.error, LostObjectError)
-        found = result.detection if result.ok else result.error.detection if lost else None
-        # not a number of keypoints
-        if found is not None and not float(found.response).is_integer():
-            query = registrar.matcher.query([shown["image"]], found.box[None].float())
-            features = {
-                "response": found.response,
-                "similarity": float(registrar.matcher.similarity(query)),
-            }
-            overlap = float(box_iou(found.box[None], shown["box"][None].double()))
-            yield {
-                "features": features,
-                "right": shown is sample and overlap >= SAME_OBJECT_OVERLAP,
-            }
+        if result.ok:
+            found = result.detection
+        elif isinstance(result.error, LostObjectError):
+            found = result.error.detection
+        else:
+            continue
+        # a number of keypoints is no similarity
+        if found is None or float(found.response).is_integer():
+            continue
+        query = registrar.matcher.query([shown["image"]], found.box[None].float())
+        similarity = float(registrar.matcher.similarity(query))
+        overlap = float(box_iou(found.box[None], shown["box"][None].double()))
+        yield {
+            "features": {"response": found.response, "similarity": similarity},
+            "right": shown is sample and overlap >= SAME_OBJECT_OVERLAP,
+        }
 
 
 def is_grey(kind: str, obj_id: int) -> bool:
@@ -245,35 +204,36 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     torch.set_num_threads(1)
     data = BOPDataset(folder)
     samples = [data[i] for i in indices]
-    other = data[beside]
-    pipeline = cr.Pipeline().with_pose_prior(pose)
-    grey = is_grey(kind, samples[0]["obj_id"])
-    mesh = mesh_of(samples[0]["model_path"], grey=grey)
-    mesh_is = "similar" if "similar" in kind else "exact"
-    registrar = cr.Registrar(mesh, pipeline=pipeline, mesh_is=mesh_is)
-    if kind == "sequences":
-        found = [(samples[0], row) for row in followed(registrar, samples)]
-    else:
-        methods: dict[str, Callable[[Row], Iterator[Row]]] = {
-            "refined": lambda s: refined(registrar, s, other),
-            "detected": lambda s: detected(registrar, s, other),
-        }
-        method = methods.get(
-            kind,
-            lambda s: registered(
-                registrar, s, with_camera=kind not in (*MODELS["category"], *ESTIMATED)
-            ),
-        )
-        found = [(s, row) for s in samples for row in method(s)]
+    obj_id = samples[0]["obj_id"]
+    grey = is_grey(kind, obj_id)
+    registrar = cr.Registrar(
+        mesh_of(samples[0]["model_path"], grey=grey),
+        pipeline=cr.Pipeline().with_pose_prior(pose),
+        mesh_is="similar" if "similar" in kind else "exact",
+    )
+    with_camera = kind not in (*MODELS["category"], *ESTIMATED)
     groups = read_json(folder / "benchmark.json")["groups"]
-    more = {"set": kind, "object": samples[0]["obj_id"], "grey": grey}
-    return [
-        {"scene": s["scene_id"], "group": f"{kind} {groups[str(s['obj_id'])]}", **more, **row}
-        for s, row in found
-    ]
+    same = {
+        "group": f"{kind} {groups[str(obj_id)]}",
+        "set": kind,
+        "object": obj_id,
+        "grey": grey,
+    }
+    rows = []
+    for sample in samples:
+        if kind == "sequences":
+            found = followed(registrar, samples) if sample is samples[0] else ()
+        elif kind == "refined":
+            found = refined(registrar, sample, data[beside])
+        elif kind == "detected":
+            found = detected(registrar, sample, data[beside])
+        else:
+            found = registered(registrar, sample, with_camera=with_camera)
+        rows += [{"scene": sample["scene_id"], **same, **row} for row in found]
+    return rows
 
 
-def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[Row]:
+def rows_of(work: Path, kind: str, jobs: int) -> list[Row]:
     """Rows of a set, or of refinements and detections in the set "shapes"; finished meshes are read
     from the file."""
     photographs = photographs_of(kind)
@@ -281,7 +241,7 @@ def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[
     out = work / f"{kind}.jsonl"
     data = BOPDataset(folder)
     annotations = [data.annotation(i) for i in range(len(data))]
-    listed = [(int(s["scene_id"]), int(s["obj_id"]), i) for i, s in enumerate(annotations)][:limit]
+    listed = [(int(s["scene_id"]), int(s["obj_id"]), i) for i, s in enumerate(annotations)]
 
     def mesh_and_pose(entry: tuple[int, int, int]) -> tuple[int, int]:
         # of these, make.py alternates upright and any pose

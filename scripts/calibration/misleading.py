@@ -42,10 +42,8 @@ from scripts.benchmark.make import TWIN, Variants
 from scripts.calibration.measure import (
     Row,
     errors_of,
-    groups_of,
     measured,
     mesh_of,
-    recorded_gaps,
     symmetries_of,
     true_centre,
 )
@@ -104,10 +102,11 @@ def stretched(image: Tensor, box: Tensor, K: Tensor) -> Case:
     H, W = image.shape[-2:]
     wide = round(STRETCH * W)
     picture = cv2.resize(image.permute(1, 2, 0).numpy(), (wide, H), interpolation=cv2.INTER_LINEAR)
-    sides = box.new_tensor([wide / W, 1.0, wide / W, 1.0])
+    box = box.clone()
+    box[[0, 2]] *= wide / W
     wrong = K.clone()
     wrong[0, 2] *= wide / W
-    return "stretched", torch.from_numpy(picture).permute(2, 0, 1), box * sides, wrong
+    return "stretched", torch.from_numpy(picture).permute(2, 0, 1), box, wrong
 
 
 def distorted(image: Tensor, box: Tensor, K: Tensor) -> Case:
@@ -115,8 +114,8 @@ def distorted(image: Tensor, box: Tensor, K: Tensor) -> Case:
     H, W = image.shape[-2:]
     camera = K.numpy()
     lens = np.array(BARREL)
-    pixels = np.stack(np.meshgrid(np.arange(W), np.arange(H)), axis=-1).reshape(-1, 1, 2)
-    source = cv2.undistortPoints(pixels.astype(np.float64), camera, lens, P=camera)
+    pixels = np.stack(np.meshgrid(np.arange(W), np.arange(H)), axis=-1).astype(np.float64)
+    source = cv2.undistortPoints(pixels.reshape(-1, 1, 2), camera, lens, P=camera)
     source = source.reshape(H, W, 2).astype(np.float32)
     picture = cv2.remap(
         image.permute(1, 2, 0).numpy(),
@@ -152,20 +151,35 @@ def answer_of(
     result: cr.Registration, registrar: cr.Registrar, sample: Row, K: Tensor | None, right_mesh: int
 ) -> Row:
     """What a result says, and how wrong it is."""
-    S = symmetries_of(sample, registrar)
     R = torch.stack([h.rotation.double() for h in result.hypotheses])
-    errors = errors_of(R, sample, S)
-    row = {"verdict": result.verdict, "reliable": result.reliable}
-    row |= {"confidence": result.confidence, "warnings": list(result.warnings)}
-    row |= {"degrees": float(errors[0]), "mesh_is_right": result.mesh_index == right_mesh}
-    row["distance"] = float(result.distance) / float(true_centre(sample).norm()) - 1.0
-    row |= groups_of(result, registrar, sample["rotation"].double() @ R[0].T, errors)
-    row["wrong"] = bool(
-        errors[0] > WRONG_DEGREES
-        or not row["mesh_is_right"]
-        or (K is not None and abs(row["distance"]) > WRONG_DISTANCE)
-    )
-    return row
+    degrees = float(errors_of(R, sample, symmetries_of(sample, registrar))[0])
+    distance = float(result.distance) / float(true_centre(sample).norm()) - 1.0
+    mesh_is_right = result.mesh_index == right_mesh
+    is_far = K is not None and abs(distance) > WRONG_DISTANCE
+    turn = sample["rotation"].double() @ R[0].T
+    return {
+        "verdict": result.verdict,
+        "reliable": result.reliable,
+        "confidence": result.confidence,
+        "warnings": list(result.warnings),
+        "degrees": degrees,
+        "distance": distance,
+        "mesh_is_right": mesh_is_right,
+        "axis_is_right": axis_is_right(result, registrar, turn),
+        "wrong": degrees > WRONG_DEGREES or not mesh_is_right or is_far,
+    }
+
+
+def axis_is_right(result: cr.Registration, registrar: cr.Registrar, turn: Tensor) -> bool:
+    """Whether the axis of a result, if it has one, is within its tolerance; ``turn`` (3, 3) leads
+    from the first hypothesis to the truth."""
+    if result.axis is None or registrar.round_axis is None:
+        return False
+    cosine = float(turn @ result.axis.direction @ result.axis.direction)
+    if registrar.round_axis.ends_are_alike:
+        cosine = abs(cosine)
+    degrees = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return degrees <= result.axis.tolerance_deg
 
 
 def measure(task: tuple[Path, list[str], list[int]]) -> list[Row]:
@@ -174,39 +188,39 @@ def measure(task: tuple[Path, list[str], list[int]]) -> list[Row]:
     torch.set_num_threads(1)
     data = BOPDataset(folder)
     samples = [data[i] for i in indices]
-    obj_id = int(samples[0]["obj_id"])
-    mesh = mesh_of(samples[0]["model_path"], grey=False)
-    alone = cr.Registrar(mesh)
+    alone = cr.Registrar(mesh_of(samples[0]["model_path"], grey=False))
     rows = []
     for kind in kinds:
-        registrars = [alone]
-        if kind in ("sizes", "chosen"):
-            # in both orders; the mesh of the photograph is the other one of a variant
-            if kind == "sizes":
-                other = replace(mesh, surface=mesh.surface.copy().apply_scale(LARGER))
-            else:
-                other = original(folder, obj_id)
-            pair = [alone.bank, cr.Registrar(other).bank]
-            registrars = [cr.Registrar(pair), cr.Registrar(pair[::-1])]
-        for sample in samples:
-            for turned, registrar in enumerate(registrars):
-                shown = int(kind == "chosen") if len(registrars) > 1 else 0
-                for name, image, box, K in cases_of(kind, sample):
-                    with recorded_gaps() as gaps:
-                        found = registrar([image], box[None].float(), K)[0]
-                    row = {
-                        "gap": gaps[0] if gaps else None,
-                        "kind": kind,
-                        "way": name,
-                        "scene": int(sample["scene_id"]),
-                    }
-                    if not found.ok:
-                        rows.append({**row, "reliable": False, "error": str(found.error)})
-                        continue
-                    row |= answer_of(found, alone, sample, K, shown ^ turned)
-                    row["wrong"] = row["wrong"] or kind == "stranger"
+        for registrar, right_mesh in registrars_of(kind, alone, folder, samples[0]):
+            for sample in samples:
+                for way, image, box, K in cases_of(kind, sample):
+                    row = {"kind": kind, "way": way, "scene": int(sample["scene_id"])}
+                    found = registrar([image], box[None].float(), K)[0]
+                    if found.ok:
+                        row |= answer_of(found, alone, sample, K, right_mesh)
+                        row["wrong"] = row["wrong"] or kind == "stranger"
+                    else:
+                        row |= {"reliable": False, "error": str(found.error)}
                     rows.append(row)
     return rows
+
+
+def registrars_of(
+    kind: str, alone: cr.Registrar, folder: Path, sample: Row
+) -> list[tuple[cr.Registrar, int]]:
+    """The registrar of the mesh ``alone``, or two of the mesh and another one, in both orders; and
+    which mesh the photograph shows."""
+    mesh = alone.bank.mesh
+    if kind == "sizes":
+        other = replace(mesh, surface=mesh.surface.copy().apply_scale(LARGER))
+        shown = 0
+    elif kind == "chosen":
+        other = original(folder, int(sample["obj_id"]))
+        shown = 1
+    else:
+        return [(alone, 0)]
+    pair = [alone.bank, cr.Registrar(other).bank]
+    return [(cr.Registrar(pair), shown), (cr.Registrar(pair[::-1]), 1 - shown)]
 
 
 def original(folder: Path, obj_id: int) -> Any:
@@ -245,12 +259,14 @@ def table_of(rows: Sequence[Row]) -> Row:
     """Counts of some rows."""
     sure = [row for row in rows if row["reliable"]]
     axes = [row for row in rows if row.get("verdict") == "reliable axis"]
-    confident = [row for row in rows if (row.get("confidence") or 0.0) >= RELIABLE]
-    table = {"photographs": len(rows), "confident": len(confident), "reliable": len(sure)}
-    table["reliable and wrong"] = sum(row["wrong"] for row in sure)
-    table["axis reliable"] = len(axes)
-    table["axis reliable and wrong"] = sum(not row["axis"][1] for row in axes)
-    return table
+    return {
+        "photographs": len(rows),
+        "confident": sum((row.get("confidence") or 0.0) >= RELIABLE for row in rows),
+        "reliable": len(sure),
+        "reliable and wrong": sum(row["wrong"] for row in sure),
+        "axis reliable": len(axes),
+        "axis reliable and wrong": sum(not row["axis_is_right"] for row in axes),
+    }
 
 
 def main() -> None:
@@ -260,22 +276,18 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", choices=SOURCES, default=list(SOURCES))
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
-    tasks = [
-        ([folder.name, kinds, indices], (folder, kinds, indices))
-        for name in options.sets
-        for folder, kinds, indices in tasks_of(options.work, name, options.each)
-    ]
+    tasks = []
+    for name in options.sets:
+        for folder, kinds, indices in tasks_of(options.work, name, options.each):
+            tasks.append(([folder.name, kinds, indices], (folder, kinds, indices)))
     out = options.work / "misleading.jsonl"
     rows = measured(out, tasks, measure, options.jobs, "misleading")
     misleading = [row for row in rows if row["kind"] != "ordinary"]
-    ways = sorted({(row["kind"], row["way"]) for row in rows})
-    record = stamp() | {"misleading": table_of(misleading)}
-    record["kinds"] = {
-        f"{kind}: {way}" if kind == "camera" else kind: table_of(
-            [row for row in rows if (row["kind"], row["way"]) == (kind, way)]
-        )
-        for kind, way in ways
-    }
+    record = stamp() | {"misleading": table_of(misleading), "kinds": {}}
+    for kind, way in sorted({(row["kind"], row["way"]) for row in rows}):
+        name = f"{kind}: {way}" if kind == "camera" else kind
+        some = [row for row in rows if (row["kind"], row["way"]) == (kind, way)]
+        record["kinds"][name] = table_of(some)
     print(json.dumps(record, indent=2))
     write_json(RESULTS / "misleading.json", record)
 

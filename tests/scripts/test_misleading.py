@@ -12,13 +12,14 @@ import torch
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.registration.result import Axis
 from scripts.benchmark.make import PART_AREA, TWIN, Variants
-from scripts.calibration.measure import groups_of, measured
+from scripts.calibration.measure import measured
 from scripts.calibration.misleading import (
     BARREL,
     CROPPED,
     LARGER,
     STRETCH,
     answer_of,
+    axis_is_right,
     cases_of,
     table_of,
 )
@@ -109,21 +110,21 @@ def test_other_kinds_change_the_mesh_alone(sample):
 
 
 def test_wrong_ones_are_counted_among_the_reliable():
-    def row(*, reliable, wrong, verdict="unsure", confidence=0.5, axis=None):
+    def row(*, reliable, wrong, verdict="unsure", confidence=0.5, axis_is_right=False):
         return {
             "reliable": reliable,
             "wrong": wrong,
             "verdict": verdict,
             "confidence": confidence,
-            "axis": axis,
+            "axis_is_right": axis_is_right,
         }
 
     rows = [
         row(reliable=True, wrong=False, verdict="reliable", confidence=0.95),
         row(reliable=True, wrong=True, verdict="reliable", confidence=0.95),
         row(reliable=False, wrong=True, confidence=0.95),
-        row(reliable=False, wrong=True, verdict="reliable axis", axis=[0.95, False]),
-        row(reliable=False, wrong=True, verdict="reliable axis", axis=[0.95, True]),
+        row(reliable=False, wrong=True, verdict="reliable axis"),
+        row(reliable=False, wrong=True, verdict="reliable axis", axis_is_right=True),
     ]
     assert table_of(rows) == {
         "photographs": 5,
@@ -163,24 +164,19 @@ def test_an_answer_is_wrong_by_its_angle_its_distance_or_its_mesh(small_bank):
     assert answer_of(result, registrar, other, None, 0)["wrong"]
 
 
-def test_pairs_and_axes_are_right_within_their_bounds():
-    axis = Axis(double([0.0, 0.0, 1.0]), 0.9)
-    result = SimpleNamespace(pair_probability=0.8, probabilities=(0.5, 0.0, 0.3, 0.1), axis=axis)
-    errors = torch.tensor([150.0, 5.0, 29.0, 3.0])
+def test_axes_are_right_within_their_tolerance():
+    result = SimpleNamespace(axis=Axis(double([0.0, 0.0, 1.0]), 0.9))
 
     def judged(degrees, *, ends_are_alike=False):
         turn = rotation_from_axis_angle(double([radians(degrees), 0.0, 0.0]))
         registrar = SimpleNamespace(round_axis=SimpleNamespace(ends_are_alike=ends_are_alike))
-        return groups_of(result, registrar, turn, errors)
+        return axis_is_right(result, registrar, turn)
 
-    assert judged(14.0) == {"pair": [0.8, True], "axis": [0.9, True]}
-    assert judged(16.0)["axis"] == [0.9, False]
-    assert judged(170.0)["axis"] == [0.9, False]
-    assert judged(170.0, ends_are_alike=True)["axis"] == [0.9, True]
-    errors[2] = 31.0
-    assert judged(0.0)["pair"] == [0.8, False], (
-        "of those with a probability, the third does not count"
-    )
+    assert judged(14.0)
+    assert not judged(16.0)
+    assert not judged(170.0)
+    assert judged(170.0, ends_are_alike=True)
+    assert not axis_is_right(SimpleNamespace(axis=None), SimpleNamespace(round_axis=None), None)
 
 
 def test_finished_tasks_are_kept(tmp_path, monkeypatch):
