@@ -42,12 +42,13 @@ from scripts._shared import parser_of, read_json, write_json
 from scripts.scenes.families import FAMILIES, random_shape
 from scripts.scenes.materials import random_texture
 from scripts.scenes.packages import package
-from scripts.scenes.scene import Scene, camera_path, cut, shelf, simulate_camera, single
+from scripts.scenes.scene import Scene, View, camera_path, cut, shelf, simulate_camera, single
 from scripts.scenes.surfaces import Array, Rng
-from scripts.scenes.textured import TexturedMesh, plain_texture
+from scripts.scenes.textured import Placed, TexturedMesh, plain_texture
 from scripts.scenes.tied import FAMILIES as TIED_FAMILIES
 from scripts.scenes.tied import tied_shape
 
+SIZE = (480, 640)  # of photographs
 KINDS = ("printed", "shelf", "furniture", "shapes", "tied")
 CADS = ("exact", "similar", "wrong", "print", "mirrored", "variant")
 # fraction of the surface that has the same material after a symmetry of the appearance
@@ -56,7 +57,7 @@ TWINS = ("print", "mirrored", "variant")
 """Of these an object is annotated as another one, which has its number and ``TWIN``."""
 
 TWIN = 100_000
-ATTEMPTS = 60  # at a scene of which the right fraction is hidden
+ATTEMPTS = 60  # at a scene of which little enough is hidden
 MIN_PIXELS = 400  # of a silhouette; smaller ones are not annotated
 PART_AREA = (0.08, 0.5)  # fraction of the surface that differs in a variant
 # factor between the proportions of similar objects; if none is within it, the closest is taken
@@ -67,8 +68,6 @@ FULL_TURN = 12
 
 class Packages:
     """Printed packages; object k depends only on the seed and k. A twin has another print."""
-
-    photographs: Sequence[Path] = ()  # pictures on walls and floors
 
     def __init__(self, options: Namespace) -> None:
         self.seed = options.seed
@@ -102,13 +101,8 @@ class Packages:
         return self.mesh(int(rng.choice(self.ids)))
 
     def texture(self, rng: Rng) -> Array:
-        if not self.photographs or rng.random() < 0.5:
-            return random_texture(rng)
-        picture = cv2.imread(str(self.photographs[rng.integers(len(self.photographs))]))
-        if picture is None:
-            return random_texture(rng)
-        picture = cv2.resize(picture, (512, 512), interpolation=cv2.INTER_AREA)[..., ::-1]
-        return (picture / 255.0).astype(np.float32) ** 2.2
+        """Of walls and floors."""
+        return random_texture(rng)
 
 
 class Shapes(Packages):
@@ -228,10 +222,10 @@ class Furniture(Packages):
 
     def __init__(self, options: Namespace) -> None:
         listing = read_json(options.meshes / "meshes.json")
+        rows = listing["meshes"]
         self.folder = options.meshes
         self.turns = np.array(listing["turns"])
         about_z = {k for k, R in enumerate(self.turns) if R[2, 2] > 0.99}
-        rows = [m for m in listing["meshes"] if m["half"] == options.half]
         good = [m for m in rows if min(m["extents"]) > 0.08 * max(m["extents"])]
         good = [m for m in good if len(set(m["look_symmetries"]) & about_z) < FULL_TURN]
         self.surroundings = [m for m in rows if m["faces"] < 6000]
@@ -275,11 +269,17 @@ class Furniture(Packages):
         return int(rng.choice([k for k, gap in zip(others, gaps, strict=True) if gap <= limit]))
 
     def clutter(self, rng: Rng) -> TexturedMesh:
-        while True:
-            try:
-                return self._load(self.surroundings[rng.integers(len(self.surroundings))]["path"])
-            except Exception:  # files that trimesh cannot read are not used
-                continue
+        return self._load(self.surroundings[rng.integers(len(self.surroundings))]["path"])
+
+    def texture(self, rng: Rng) -> Array:
+        """Half of them are pictures of the catalogue."""
+        if not self.photographs or rng.random() < 0.5:
+            return random_texture(rng)
+        picture = cv2.imread(str(self.photographs[rng.integers(len(self.photographs))]))
+        if picture is None:
+            return random_texture(rng)
+        picture = cv2.resize(picture, (512, 512), interpolation=cv2.INTER_AREA)[..., ::-1]
+        return (picture / 255.0).astype(np.float32) ** 2.2
 
 
 def model_row(objects: Packages, folder: Path, obj_id: int) -> dict[str, Any]:
@@ -292,8 +292,9 @@ def model_row(objects: Packages, folder: Path, obj_id: int) -> dict[str, Any]:
     low = 1000.0 * mesh.hull.min(axis=0)
     size = 1000.0 * mesh.hull.max(axis=0) - low
     row = {"diameter": 1000.0 * float(pdist(mesh.hull).max())}
-    row |= {f"min_{c}": float(x) for c, x in zip("xyz", low, strict=True)}
-    row |= {f"size_{c}": float(x) for c, x in zip("xyz", size, strict=True)}
+    for k, axis in enumerate("xyz"):
+        row[f"min_{axis}"] = float(low[k])
+        row[f"size_{axis}"] = float(size[k])
     discrete = []
     for S in objects.symmetries(obj_id)[1:]:
         T = np.eye(4)
@@ -334,7 +335,7 @@ def full_shelf(objects: Packages, options: Namespace, rng: Rng) -> tuple[Scene, 
         list(annotated.values()),
         objects.texture,
         rng,
-        size=options.size,
+        size=SIZE,
         occlusion=options.occlusion,
         cameras=options.cameras,
     )
@@ -356,9 +357,9 @@ def lone_object(
         objects.clutter,
         objects.texture,
         rng,
-        size=options.size,
-        upright=options.pose == "upright" or (options.pose == "mixed" and index % 2 == 0),
-        occluded=bool(options.hidden or (rng.random() < 0.3 and attempt < 12)),
+        size=SIZE,
+        upright=index % 2 == 0,
+        occluded=bool(rng.random() < 0.3 and attempt < 12),
         cameras=options.cameras,
     )
     named = shown
@@ -372,7 +373,7 @@ def lone_object(
     if options.cut:
         fraction = float(rng.uniform(*options.cut))
         hull = scene.shapes[0].hull
-        views = [cut(view, hull, options.size, fraction, rng) for view in scene.views]
+        views = [cut(view, hull, SIZE, fraction, rng) for view in scene.views]
         scene = replace(scene, views=views)
     return scene, {shown: (named, objects.mesh(named))}
 
@@ -382,68 +383,77 @@ def make_scene(objects: Packages, options: Namespace, index: int) -> None:
     folder = options.out / "test" / f"{index:06d}"
     if folder.exists():
         return
-    least, most = options.hidden or (0.0, options.occlusion)
     for attempt in range(ATTEMPTS):
         scene, annotated = compose(objects, options, index, attempt)
-        pictures = [scene.render(view, options.size) for view in scene.views]
-        seen, whole = (
-            np.array([getattr(p, name).sum(axis=(1, 2)) for p in pictures])
-            for name in ("seen", "whole")
-        )
+        pictures = [scene.render(view, SIZE) for view in scene.views]
+        seen = np.array([picture.seen.sum(axis=(1, 2)) for picture in pictures])
+        whole = np.array([picture.whole.sum(axis=(1, 2)) for picture in pictures])
         hidden = 1.0 - seen / np.maximum(whole, 1)
-        is_right = options.kind == "shelf" or (hidden.min() >= least and hidden.max() <= most)
-        if is_right and (whole[:, 0] >= MIN_PIXELS).all():
+        in_sight = options.kind == "shelf" or hidden.max() <= options.occlusion
+        if in_sight and (whole[:, 0] >= MIN_PIXELS).all():
             break
     else:
-        raise RuntimeError(f"scene {index}: too much or too little is hidden in every attempt")
+        raise RuntimeError(f"scene {index}: too much is hidden in every attempt")
     part = folder.with_suffix(".part")
     shutil.rmtree(part, ignore_errors=True)
     (part / "rgb").mkdir(parents=True)
     truths = {}
     infos = {}
     cameras = {}
-    mm = 1000.0 / scene.annotated[0].scale
-    for k, ((R, t, K), picture) in enumerate(zip(scene.views, pictures, strict=True)):
+    for k, (view, picture) in enumerate(zip(scene.views, pictures, strict=True)):
         seed = (options.seed, index, 0 if options.frames > 1 else k)  # one camera takes all frames
         image = simulate_camera(picture.linear, np.random.default_rng(seed))
         cv2.imwrite(str(part / "rgb" / f"{k:06d}.png"), image[..., ::-1])
-        cameras[k] = {
-            "cam_K": K.ravel().tolist(),
-            "depth_scale": 1.0,
-            "cam_R_w2c": R.ravel().tolist(),
-            "cam_t_w2c": (mm * t).tolist(),
-        }
+        cameras[k] = camera_row(scene, view)
         truths[k] = []
         infos[k] = []
         masks = zip(scene.annotated, picture.seen, picture.whole, strict=True)
         for shape, seen_mask, whole_mask in masks:
-            count = int(whole_mask.sum())
-            if count < MIN_PIXELS:
-                continue
-            obj_id, mesh = annotated[shape.obj_id]
-            rotation, translation = shape.pose(R, t)
-            translation = translation + rotation @ (shape.mesh.centre - mesh.centre)
-            truths[k].append(
-                {
-                    "cam_R_m2c": rotation.ravel().tolist(),
-                    "cam_t_m2c": (1000.0 * translation).tolist(),
-                    "obj_id": obj_id,
-                }
-            )
-            visible = int(seen_mask.sum())
-            infos[k].append(
-                {
-                    "bbox_obj": _box(whole_mask),
-                    "bbox_visib": _box(seen_mask),
-                    "px_count_all": count,
-                    "px_count_visib": visible,
-                    "px_count_valid": count,
-                    "visib_fract": visible / count,
-                }
-            )
+            if whole_mask.sum() >= MIN_PIXELS:
+                truths[k].append(truth_row(shape, view, annotated))
+                infos[k].append(info_row(seen_mask, whole_mask))
     for name, content in (("gt", truths), ("camera", cameras), ("gt_info", infos)):
         write_json(part / f"scene_{name}.json", content)
     part.rename(folder)
+
+
+def camera_row(scene: Scene, view: View) -> dict[str, Any]:
+    """A view in ``scene_camera.json``."""
+    R, t, K = view
+    mm = 1000.0 / scene.annotated[0].scale
+    return {
+        "cam_K": K.ravel().tolist(),
+        "depth_scale": 1.0,
+        "cam_R_w2c": R.ravel().tolist(),
+        "cam_t_w2c": (mm * t).tolist(),
+    }
+
+
+def truth_row(shape: Placed, view: View, annotated: Annotated) -> dict[str, Any]:
+    """An object of a view in ``scene_gt.json``."""
+    R, t, _ = view
+    obj_id, mesh = annotated[shape.obj_id]
+    rotation, translation = shape.pose(R, t)
+    translation = translation + rotation @ (shape.mesh.centre - mesh.centre)
+    return {
+        "cam_R_m2c": rotation.ravel().tolist(),
+        "cam_t_m2c": (1000.0 * translation).tolist(),
+        "obj_id": obj_id,
+    }
+
+
+def info_row(seen: Array, whole: Array) -> dict[str, Any]:
+    """An object of a view in ``scene_gt_info.json``, by its masks with the others and without."""
+    count = int(whole.sum())
+    visible = int(seen.sum())
+    return {
+        "bbox_obj": _box(whole),
+        "bbox_visib": _box(seen),
+        "px_count_all": count,
+        "px_count_visib": visible,
+        "px_count_valid": count,
+        "visib_fract": visible / count,
+    }
 
 
 def _box(mask: Array) -> list[int]:
@@ -461,19 +471,14 @@ def write_targets(options: Namespace) -> int:
     number."""
     targets = []
     for folder in sorted(p for p in (options.out / "test").iterdir() if p.name.isdecimal()):
-        truths, infos = (read_json(folder / f"scene_{name}.json") for name in ("gt", "gt_info"))
+        truths = read_json(folder / "scene_gt.json")
+        infos = read_json(folder / "scene_gt_info.json")
         for key in sorted(truths, key=int):
             for truth, info in zip(truths[key], infos[key], strict=True):
-                if info["visib_fract"] < 1.0 - options.occlusion or min(info["bbox_visib"][2:]) < 1:
-                    continue
-                targets.append(
-                    {
-                        "scene_id": int(folder.name),
-                        "im_id": int(key),
-                        "obj_id": truth["obj_id"],
-                        "inst_count": 1,
-                    }
-                )
+                is_visible = info["visib_fract"] >= 1.0 - options.occlusion
+                if is_visible and min(info["bbox_visib"][2:]) >= 1:
+                    target = {"scene_id": int(folder.name), "im_id": int(key)}
+                    targets.append(target | {"obj_id": truth["obj_id"], "inst_count": 1})
     write_json(options.out / "test_targets_bop19.json", targets)
     return len(targets)
 
@@ -504,14 +509,9 @@ def arguments() -> ArgumentParser:
     parser.add_argument("--count", type=int, default=300, help="scenes")
     parser.add_argument("--seed", type=int, default=29)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--size", type=int, nargs=2, default=(480, 640), metavar=("H", "W"))
     parser.add_argument("--models", type=int, default=60, help="printed packages to choose from")
     parser.add_argument("--meshes", type=Path, help="folder of meshes.py, for furniture")
-    parser.add_argument(
-        "--half", choices=("held-out", "train"), default="held-out", help="of the furniture"
-    )
     parser.add_argument("--cad", choices=CADS, default="exact")
-    parser.add_argument("--pose", choices=("upright", "free", "mixed"), default="mixed")
     parser.add_argument(
         "--bare", type=float, default=0.0, help="fraction of the objects in one uniform colour"
     )
@@ -520,13 +520,6 @@ def arguments() -> ArgumentParser:
     )
     parser.add_argument(
         "--occlusion", type=float, default=0.6, help="largest hidden fraction of a target"
-    )
-    parser.add_argument(
-        "--hidden",
-        type=float,
-        nargs=2,
-        metavar=("LOW", "HIGH"),
-        help="fraction of every target behind an occluder",
     )
     parser.add_argument(
         "--cut",

@@ -4,8 +4,8 @@ The meshes are those of Debian's package sweethome3d-furniture 1.8-1: 820 OBJ fi
 and textures; CC0, CC BY 3.0 and, model by model, what the package's ``copyright`` and the
 catalogue's ``license`` say. They are not part of this project and stay in OUT. In OUT/meshes every
 object has a folder of its own; z is up, the front points along -y, and units are metres.
-OUT/meshes.json lists name, kind, half (``held-out`` or ``train``, by a hash of the name; copies of
-held-out meshes are excluded), licence, and the symmetries of shape and of appearance.
+OUT/meshes.json lists name, kind, licence, and the symmetries of shape and of appearance, of half of
+the objects, by a hash of their names.
 
     python scripts/benchmark/meshes.py --out /data/benchmark [--deb
     sweethome3d-furniture_1.8-1_all.deb]
@@ -235,8 +235,9 @@ def copy_of(cloud: np.ndarray, others: dict[str, tuple[np.ndarray, cKDTree]]) ->
     return None
 
 
-def half_of(name: str) -> str:
-    return "held-out" if hashlib.sha256(name.encode()).digest()[0] % 2 == 0 else "train"
+def is_used(name: str) -> bool:
+    """Half of the objects, by a hash of their names; the others are for learning from."""
+    return hashlib.sha256(name.encode()).digest()[0] % 2 == 0
 
 
 def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, np.ndarray | None]:
@@ -273,29 +274,22 @@ def main() -> None:
     arguments = parser.parse_args()
     unpacked = fetch(arguments.out, arguments.deb)
     once = {row["id"]: row for row in reversed(catalogue(unpacked))}  # removes duplicates
-    listing = {"package": PACKAGE, "sha256": SHA256, "turns": candidate_rotations().tolist()}
-    listing |= {"meshes": [], "left_out": {}}
+    tasks = [(row, unpacked, arguments.out) for name, row in sorted(once.items()) if is_used(name)]
+    with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
+        results = list(tqdm(pool.map(examine, tasks), total=len(tasks)))
+    meshes = []
+    left_out = {}
     clouds = {}
-    for half in ("held-out", "train"):
-        tasks = [
-            (row, unpacked, arguments.out)
-            for name, row in sorted(once.items())
-            if half_of(name) == half
-        ]
-        with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
-            results = list(tqdm(pool.map(examine, tasks), desc=half, total=len(tasks)))
-        for row, why, cloud in results:
-            like = None if why else copy_of(cloud, clouds)
-            if like is not None and half == "train" and half_of(like) == "held-out":
-                why = "copy of a held-out mesh"
-            if why is not None:
-                listing["left_out"][row["id"]] = why
-                continue
-            clouds[row["id"]] = np.ptp(cloud, axis=0), cKDTree(cloud)
-            listing["meshes"].append({**row, "half": half, "like": like or row["id"]})
-        write_json(arguments.out / "meshes.json", listing)
-        count = sum(mesh["half"] == half for mesh in listing["meshes"])
-        print(f"{half}: {count} meshes; left out {len(listing['left_out'])}")
+    for row, why, cloud in results:
+        if why is not None:
+            left_out[row["id"]] = why
+            continue
+        like = copy_of(cloud, clouds) or row["id"]
+        clouds[row["id"]] = np.ptp(cloud, axis=0), cKDTree(cloud)
+        meshes.append({**row, "like": like})
+    listing = {"package": PACKAGE, "sha256": SHA256, "turns": candidate_rotations().tolist()}
+    write_json(arguments.out / "meshes.json", listing | {"meshes": meshes, "left_out": left_out})
+    print(f"{len(meshes)} meshes; left out {len(left_out)}")
 
 
 if __name__ == "__main__":
