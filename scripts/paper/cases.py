@@ -73,20 +73,16 @@ class Case:
         return self.camera is not None and bool(self.pose[:, 3].isfinite().all())
 
 
-def find_cases(
-    kind: str, root: Path, *, pixel_origin: int = 1, limit: int | None = None
-) -> list[Case]:
+def find_cases(kind: str, root: Path, *, limit: int | None = None) -> list[Case]:
     """The objects that the paper uses: neither occluded nor truncated, with known pose; grouped by
     mesh.
 
     ``kind`` is "pascal3d", "bop" or "web"; ``limit`` uses only this many, spread evenly.
     """
     row = DATASETS[kind]
-    origin = {"pixel_origin": pixel_origin} if "pixel_origin" in row.options else {}
-    dataset = row.open(root, **row.whole, **origin)
-    cases = [
-        case for i in range(len(dataset)) if (case := _case(row, dataset.annotation(i))) is not None
-    ]
+    dataset = row.open(root, **row.whole)
+    found = (_case(row, dataset.annotation(i)) for i in range(len(dataset)))
+    cases = [case for case in found if case is not None]
     if not cases:
         raise InvalidInputError(f"{root}: holds no whole object with a known pose")
     if limit is not None and limit < len(cases):
@@ -100,10 +96,14 @@ def _case(kind: Any, s: dict[str, Any]) -> Case | None:
     known = bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all())
     if not known or s.get("visib_fract", 1.0) < UNOCCLUDED:
         return None
-    mesh = str(s[kind.scored.mesh])
-    camera = s.get("camera_matrix")
     return Case(
-        kind.category.format_map(s), s["image_path"], mesh, kind.scored.unit, s["box"], pose, camera
+        category=kind.category.format_map(s),
+        image_path=s["image_path"],
+        mesh_path=str(s[kind.scored.mesh]),
+        unit=kind.scored.unit,
+        box=s["box"],
+        pose=pose,
+        camera=s.get("camera_matrix"),
     )
 
 

@@ -6,9 +6,7 @@ frame, and S_hog as the paper prints it; ``corrected`` is that with S_hog as a c
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -34,15 +32,10 @@ from curvireg_torch.mesh import Mesh, load_mesh
 from curvireg_torch.pipeline import FIELDS, PRESETS, BankSettings, Pipeline, ViewPolicy
 from scripts.paper.cases import Case
 from scripts.paper.detectors import DETECTORS
-from scripts.paper.measures import (
-    angle_differences,
-    hausdorff_distance,
-    intersection_percentage,
-    points_within,
-    repeatability,
-)
+from scripts.paper.measures import hausdorff_distance, share_near
 from scripts.paper.tables import (
     CURVE_OFFSETS,
+    PAIRS,
     PHOTOS,
     RANKS,
     REFINED_PAIRS,
@@ -53,14 +46,12 @@ from scripts.paper.tables import (
 
 Record = dict[str, Any]
 
-DEPTHS = ("CS", "ASG", "AR")
 CURVE_DETECTORS = ("MFC", "MCS", "IG", "SIFT", "SOBEL")
 SENSITIVE = ("MFC", "MCS", "IG", "SOBEL", "CANNY")
 EPS = (1.0, 2.0, 3.0, 4.0)
 SHARES = (0.01, 0.02, 0.04, 0.08)
 BEST_PAIR = "CS/MFC"
 KNOWN_AZIMUTH_DEG = 45.0
-FOCUS_BATCH = 16  # photographs
 THRESHOLDS = (0.001, PAPER_THRESHOLD, 0.01, 0.03, 0.06, 0.1)
 
 
@@ -93,38 +84,15 @@ def photo_fields(variant: str) -> dict[str, nn.Module]:
     return {"MFC": focus, "MCS": MultiScaleCurvilinearSaliency(), "IG": ImageGradient()}
 
 
-class Remembered:
-    """A renderer of one mesh that renders every view once."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self._inner = ViewDescriber(mesh, BankSettings()).view_renderer
-        self.name = self._inner.name
-        self._known = {}
-
-    def render(
-        self,
-        T_cam_from_model: Tensor,
-        camera_matrix: Tensor,
-        size: tuple[int, int],
-        *,
-        orthographic: bool = False,
-    ) -> Tensor:
-        numbers = torch.cat([T_cam_from_model.flatten(), camera_matrix.flatten()]).numpy().tobytes()
-        key = numbers + bytes(f"{size} {orthographic}", "ascii")
-        if key not in self._known:
-            self._known[key] = self._inner.render(
-                T_cam_from_model, camera_matrix, size, orthographic=orthographic
-            )
-        return self._known[key].clone()
+def sized(pipeline: Pipeline, settings: BankSettings) -> Pipeline:
+    """The pipeline with crops as in ``settings``."""
+    bank = replace(pipeline.bank, image_size=settings.image_size, margin=settings.margin)
+    return replace(pipeline, bank=bank)
 
 
-def detectors_of(share: float) -> dict[str, Callable[[Tensor], Tensor]]:
-    """Detectors (1, 1, H, W) -> (H, W) bool, by name in capitals."""
-
-    def points(detect: Callable[..., Tensor], image: Tensor) -> Tensor:
-        return detect(image, fraction=share)[0, 0]
-
-    return {name.upper(): partial(points, detect) for name, detect in DETECTORS.items()}
+def detected(crop: Tensor, share: float) -> dict[str, Tensor]:
+    """Points (H, W) bool of every detector in a crop (1, 1, H, W), by name in capitals."""
+    return {name.upper(): detect(crop, fraction=share)[0, 0] for name, detect in DETECTORS.items()}
 
 
 @torch.no_grad()
@@ -142,47 +110,42 @@ def _points_of(
 ) -> Record:
     crop = rgb_to_grayscale(case.crop(settings))
     R, distance = case.view(mesh)
-    turned = R @ _turns_about_z()
-    around = turned, torch.full((len(turned),), distance, dtype=torch.float64)
+    distances = torch.tensor([distance], dtype=torch.float64)
     share = settings.point_fraction
-    fields = {
-        name: describe.fields(R[None], around[1][:1]) for name, describe in describers.items()
-    }
+    photos = detected(crop, share)
+    fields = {name: describe.fields(R[None], distances) for name, describe in describers.items()}
     views = {name: field_points(field, fraction=share)[0, 0] for name, field in fields.items()}
-    photos = {name: detect(crop) for name, detect in detectors_of(share).items()}
     view = views["CS"]
+    turned = R @ _turns_about_z()
+    around = describers["CS"].fields(turned, distances.expand(len(turned)))
+    circle = field_points(around, fraction=share)[:, 0]
     record = {
-        "ip": {name: float(intersection_percentage(photo, view)) for name, photo in photos.items()},
-        "hausdorff": {
-            name: float(hausdorff_distance(photo, view)) for name, photo in photos.items()
-        },
+        "ip": {name: share_near(photo, view) for name, photo in photos.items()},
+        "hausdorff": {name: hausdorff_distance(photo, view) for name, photo in photos.items()},
         "points": {name: int(photo.sum()) for name, photo in photos.items()},
         "repeatability": {
-            f"{depth}/{name}": float(repeatability(points, photos[name]))
+            f"{depth}/{name}": share_near(points, photos[name])
             for depth, points in views.items()
             for name in PHOTOS
         },
+        "curve": {
+            name: [share_near(one, photos[name]) for one in circle] for name in CURVE_DETECTORS
+        },
+        "sensitivity": {},
+        "threshold": {},
     }
-    record["ip"]["chance"] = float(intersection_percentage(torch.ones_like(view), view))
-    circle = field_points(describers["CS"].fields(*around), fraction=share)[:, 0]
-    record["curve"] = {
-        name: [float(repeatability(one, photos[name])) for one in circle]
-        for name in CURVE_DETECTORS
-    }
-    record["sensitivity"] = {}
+    record["ip"]["chance"] = share_near(torch.ones_like(view), view)
     for share in SHARES:
         few = field_points(fields["CS"], fraction=share)[0, 0]
-        detect = detectors_of(share)
+        found = detected(crop, share)
         for name in SENSITIVE:
-            found = points_within(detect[name](crop), few, EPS)
-            record["sensitivity"] |= {
-                f"{name} {share:g} {eps:g}": value for eps, value in zip(EPS, found, strict=True)
-            }
-    record["threshold"] = {}
+            for eps in EPS:
+                key = f"{name} {share:g} {eps:g}"
+                record["sensitivity"][key] = share_near(found[name], few, eps_px=eps)
     for threshold in THRESHOLDS:
         field = FIELDS["MFC"](threshold=threshold)(crop)
         points = field_points(field, fraction=settings.point_fraction)[0, 0]
-        record["threshold"][f"{threshold:.4f}"] = float(intersection_percentage(points, view))
+        record["threshold"][f"{threshold:.4f}"] = share_near(points, view)
     return record
 
 
@@ -198,106 +161,114 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
     """Rankings of all views, and the poses that the paper's search finds, for each pair of
     filters."""
     mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
-    renderer = Remembered(mesh)
     describe = ViewDescriber(mesh, settings)
-    crops = torch.cat([case.crop(settings) for case in cases])
-    truths = torch.stack([case.view(mesh)[0] for case in cases])
+    views = [case.view(mesh)[0] for case in cases]
+    truths = [Truth(case, R, describe) for case, R in zip(cases, views, strict=True)]
+    crops = [case.crop(settings) for case in cases]
     records = [{} for _ in cases]
     banks = {}
 
-    def bank_of(pipeline: Pipeline) -> ViewBank:
+    def matcher_of(pipeline: Pipeline, **bank: Any) -> ViewMatcher:
         """Variants that differ in their terms share views."""
-        key = pipeline.views, pipeline.bank
+        pipeline = replace(pipeline, bank=replace(pipeline.bank, **bank))
+        key = (pipeline.views, pipeline.bank)
         if key not in banks:
-            banks[key] = ViewBank.build(mesh, pipeline=pipeline, renderer=renderer, progress=False)
-        return banks[key]
+            banks[key] = ViewBank.build(mesh, pipeline=pipeline, progress=False)
+        return ViewMatcher(banks[key], pipeline=pipeline)
 
     for variant, pipeline in variants(pose).items():
-        bank_settings = replace(
-            pipeline.bank, image_size=settings.image_size, margin=settings.margin
-        )
-        pipeline = replace(pipeline, bank=bank_settings)
+        pipeline = sized(pipeline, settings)
         fields = photo_fields(variant)
-        for depth in DEPTHS:
-            given = replace(pipeline, bank=replace(bank_settings, depth_field=depth))
-            bank = bank_of(given)
-            errors = rotation_error(truths[:, None], bank.rotations.double())
-            matcher = ViewMatcher(bank, pipeline=given, renderer=renderer)
-            for photo in PHOTOS:
-                matcher.field = fields[photo]
-                for b, case in enumerate(cases):
-                    wider = f"{depth}/{photo}" in SEARCHED_PAIRS
-                    found = _ranked(matcher, crops[b], case, truths[b], errors[b], describe, wider)
-                    if variant == "corrected" and f"{depth}/{photo}" in REFINED_PAIRS:
-                        found["refined"] = _closest_refined(
-                            matcher, crops[b], case, truths[b], describe
-                        )
-                    records[b].setdefault(variant, {})[f"{depth}/{photo}"] = found
-        limit = errors.argmin(dim=1)
-        for b, case in enumerate(cases):
-            records[b][variant]["limit"] = _pose_errors(
-                bank.rotations[limit[b]], case, truths[b], describe
-            )
+        found = [record.setdefault(variant, {}) for record in records]
+        for pair in PAIRS:
+            depth, photo = pair.split("/")
+            matcher = matcher_of(pipeline, depth_field=depth)
+            matcher.field = fields[photo]
+            for b, truth in enumerate(truths):
+                found[b][pair] = _ranked(matcher, crops[b], truth, wider=pair in SEARCHED_PAIRS)
+                if variant == "corrected" and pair in REFINED_PAIRS:
+                    found[b][pair]["refined"] = _closest_refined(matcher, crops[b], truth)
+        rotations = matcher.bank.rotations
+        for b, truth in enumerate(truths):
+            errors = truth.errors(rotations)
+            found[b]["limit"] = truth.pose_errors(rotations[errors.argmin()])
             # what a ranking by lot and the best one would have
-            records[b][variant]["chance"] = float((errors[b] < RIGHT_DEG).double().mean())
-            records[b][variant]["ceiling"] = float(errors[b].min() < RIGHT_DEG)
-            records[b][variant]["grid 8"] = records[b][variant][BEST_PAIR]["top"][0]
+            found[b]["chance"] = float((errors < RIGHT_DEG).double().mean())
+            found[b]["ceiling"] = float(errors.min() < RIGHT_DEG)
+            found[b]["grid 8"] = found[b][BEST_PAIR]["top"][0]
         for grid in (4, 16):
-            given = replace(pipeline, bank=replace(bank_settings, grid=grid))
-            matcher = ViewMatcher(
-                bank_of(given), pipeline=given, renderer=renderer, field=fields["MFC"]
-            )
-            for b in range(len(cases)):
-                best = matcher.rank(matcher.features(crops[b : b + 1])).order[0, 0]
-                records[b][variant][f"grid {grid}"] = float(errors[b, best])
+            matcher = matcher_of(pipeline, grid=grid)
+            matcher.field = fields["MFC"]
+            for b, truth in enumerate(truths):
+                best = matcher.rank(matcher.features(crops[b])).order[0, 0]
+                found[b][f"grid {grid}"] = float(truth.errors(rotations)[best])
     return records
 
 
-def _ranked(
-    matcher: ViewMatcher,
-    crop: Tensor,
-    case: Case,
-    truth: Tensor,
-    errors: Tensor,
-    describe: ViewDescriber,
-    wider: bool,
-) -> Record:
+@dataclass(frozen=True)
+class Truth:
+    """The rotation ``R`` (3, 3) of a photograph's object, as a camera that looks at it sees it."""
+
+    case: Case
+    R: Tensor
+    describe: ViewDescriber
+
+    def errors(self, rotations: Tensor) -> Tensor:
+        """Degrees between rotations (..., 3, 3) and the truth."""
+        return rotation_error(self.R, rotations.double())
+
+    def pose_errors(self, rotation: Tensor) -> list[float]:
+        """Absolute errors of elevation, azimuth and in-plane angle in degrees, and of the distance,
+        at which the view fills the box of the photograph, in percent."""
+        found = torch.stack(viewpoint_from_rotation(rotation.double()))
+        true = torch.stack(viewpoint_from_rotation(self.R))
+        azimuth, elevation, theta = ((found - true + 180.0) % 360.0 - 180.0).abs().tolist()
+        return [elevation, azimuth, theta, self.distance_error(rotation)]
+
+    def distance_error(self, rotation: Tensor) -> float:
+        case = self.case
+        if not case.has_distance or case.camera is None:
+            return math.nan
+        centre = self.describe.centre
+        box = case.box.double()
+        R, t = pose_from_box(self.describe.hull, rotation.double(), box, case.camera.double())
+        true = torch.linalg.vector_norm(case.pose[:, :3] @ centre + case.pose[:, 3])
+        return 100.0 * abs(float(torch.linalg.vector_norm(R @ centre + t) / true) - 1.0)
+
+
+def _ranked(matcher: ViewMatcher, crop: Tensor, truth: Truth, *, wider: bool) -> Record:
     """``wider``: with what the search finds between views down the ranking until two are
     coherent."""
-    query = matcher.features(crop[None])
+    rotations = matcher.bank.rotations
+    query = matcher.features(crop)
     ranking = matcher.rank(query)
     # Views at several distances are one picture to an orthographic camera.
-    top = different_views(matcher.bank.rotations, ranking.order[0], max(RANKS))
+    top = different_views(rotations, ranking.order[0], max(RANKS))
+    errors = truth.errors(rotations[top])
     rotation, _ = search(matcher, query, ranking)
-    retrieved = top[:BEST_VIEWS]
-    closest = retrieved[errors[retrieved].argmin()]
+    closest = top[errors[:BEST_VIEWS].argmin()]
     record = {
-        "top": errors[top].tolist(),
-        "est": _pose_errors(rotation, case, truth, describe),
-        "found": float(rotation_error(truth, rotation)),
+        "top": errors.tolist(),
+        "est": truth.pose_errors(rotation),
+        "found": float(truth.errors(rotation)),
         "coherent": len(coherent_of(matcher.bank, ranking)),
-        "clo": _pose_errors(matcher.bank.rotations[closest], case, truth, describe),
+        "clo": truth.pose_errors(rotations[closest]),
     }
     if wider:
         if record["coherent"] == 1:
             rotation, _ = search(matcher, query, ranking, least_coherent=2)
-        record["wider found"] = float(rotation_error(truth, rotation))
+        record["wider found"] = float(truth.errors(rotation))
     return record
 
 
-def _closest_refined(
-    matcher: ViewMatcher, crop: Tensor, case: Case, truth: Tensor, describe: ViewDescriber
-) -> list[float]:
+def _closest_refined(matcher: ViewMatcher, crop: Tensor, truth: Truth) -> list[float]:
     """Errors of the closest of the three retrieved views, each replaced by the best of a grid of 5°
     as far as half way to the next view of the bank."""
-    query = matcher.features(crop[None])
+    query = matcher.features(crop)
     order = matcher.rank(query).order[0]
-    refined = [
-        refine(matcher, query, int(view))
-        for view in different_views(matcher.bank.rotations, order, BEST_VIEWS)
-    ]
-    closest = min(refined, key=lambda R: float(rotation_error(truth, R)))
-    return _pose_errors(closest, case, truth, describe)
+    views = different_views(matcher.bank.rotations, order, BEST_VIEWS)
+    refined = torch.stack([refine(matcher, query, int(view)) for view in views])
+    return truth.pose_errors(refined[truth.errors(refined).argmin()])
 
 
 @torch.no_grad()
@@ -305,79 +276,43 @@ def measure_focus(cases: list[Case], settings: BankSettings, pose: str) -> list[
     """IP and the best views of focus curves by threshold, and of the fields beside them, in the
     ranking "corrected"; and what of them is right by other protocols."""
     mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
-    pipeline = variants(pose)["corrected"]
-    pipeline = replace(
-        pipeline,
-        bank=replace(pipeline.bank, image_size=settings.image_size, margin=settings.margin),
-    )
+    pipeline = sized(variants(pose)["corrected"], settings)
     bank = ViewBank.build(mesh, pipeline=pipeline, progress=False)
     matcher = ViewMatcher(bank, pipeline=pipeline)
-    rotations = bank.rotations.double()
-    azimuths = torch.stack([viewpoint_from_rotation(R)[0] for R in rotations])
-    records = []
-    for k in range(0, len(cases), FOCUS_BATCH):
-        records += _focus_of(cases[k : k + FOCUS_BATCH], mesh, matcher, rotations, azimuths)
-    return records
+    azimuths = torch.stack([viewpoint_from_rotation(R)[0] for R in bank.rotations.double()])
+    return [_focus_of(case, mesh, matcher, azimuths) for case in cases]
 
 
-def _focus_of(
-    cases: Sequence[Case],
-    mesh: Mesh,
-    matcher: ViewMatcher,
-    rotations: Tensor,
-    azimuths: Tensor,
-) -> list[Record]:
-    """:func:`measure_focus` of some photographs, whose fields are computed together."""
-    fraction = matcher.bank.settings.point_fraction
-    crops = torch.cat([case.crop(matcher.bank.settings) for case in cases])
+def _focus_of(case: Case, mesh: Mesh, matcher: ViewMatcher, azimuths: Tensor) -> Record:
+    rotations = matcher.bank.rotations.double()
+    settings = matcher.bank.settings
+    crop = case.crop(settings)
+    R, distance = case.view(mesh)
+    field = matcher.describer.fields(R[None], torch.tensor([distance], dtype=torch.float64))
+    view = field_points(field, fraction=settings.point_fraction)[0, 0]
+    errors = rotation_error(R, rotations)
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-    views = []
-    errors = []
-    near = []
-    records = []
-    for case in cases:
-        R, distance = case.view(mesh)
-        field = matcher.describer.fields(R[None], torch.tensor([distance]).double())
-        views.append(field_points(field, fraction=fraction)[0, 0])
-        of_view = rotation_error(R, rotations)
-        turned = torch.minimum(of_view, rotation_error(R @ half_turn, rotations))
-        errors.append({"right": of_view, "half turn": turned})
-        apart = ((azimuths - viewpoint_from_rotation(R)[0] + 180.0) % 360.0 - 180.0).abs()
-        near.append(apart <= KNOWN_AZIMUTH_DEG)
-        right = (of_view < RIGHT_DEG).double()
-        chance = {
-            "right": float(right.mean()),
+    turned = torch.minimum(errors, rotation_error(R @ half_turn, rotations))
+    apart = (azimuths - viewpoint_from_rotation(R)[0] + 180.0) % 360.0 - 180.0
+    is_near = apart.abs() <= KNOWN_AZIMUTH_DEG
+    right = (errors < RIGHT_DEG).double()
+    by_lot = float(right.mean())
+    record = {
+        "chance": {
+            "right": by_lot,
             "half turn": float((turned < RIGHT_DEG).double().mean()),
-            "azimuth": float(right[near[-1]].mean()),
-            "top 20": 1.0 - (1.0 - float(right.mean())) ** 20,
+            "azimuth": float(right[is_near].mean()),
+            "top 20": 1.0 - (1.0 - by_lot) ** 20,
         }
-        records.append({"chance": chance})
+    }
     for name, matcher.field in focus_fields().items():
-        query = matcher.features(crops)
-        orders = matcher.rank(query).order
-        for b, order in enumerate(orders):
-            right = errors[b]["right"]
-            records[b][name] = {
-                "ip": float(intersection_percentage(query.points[b, 0], views[b])),
-                "right": float(right[order[0]]),
-                "half turn": float(errors[b]["half turn"][order[0]]),
-                "azimuth": float(right[order[near[b][order]][0]]),
-                "top 20": float(right[order[:20]].min()),
-            }
-    return records
-
-
-def _pose_errors(
-    rotation: Tensor, case: Case, truth: Tensor, describe: ViewDescriber
-) -> list[float]:
-    """Absolute errors of elevation, azimuth and in-plane angle in degrees, and of the distance, at
-    which the view fills the box of the photograph, in percent."""
-    angles = [torch.stack(viewpoint_from_rotation(R.double())) for R in (rotation, truth)]
-    azimuth, elevation, theta = angle_differences(*angles).tolist()
-    error = math.nan
-    if case.has_distance and case.camera is not None:
-        K = case.camera.double()
-        R, t = pose_from_box(describe.hull, rotation.double(), case.box.double(), K)
-        true = torch.linalg.vector_norm(case.pose[:, :3] @ describe.centre + case.pose[:, 3])
-        error = 100.0 * abs(float(torch.linalg.vector_norm(R @ describe.centre + t) / true) - 1.0)
-    return [elevation, azimuth, theta, error]
+        query = matcher.features(crop)
+        order = matcher.rank(query).order[0]
+        record[name] = {
+            "ip": share_near(query.points[0, 0], view),
+            "right": float(errors[order[0]]),
+            "half turn": float(turned[order[0]]),
+            "azimuth": float(errors[order[is_near[order]][0]]),
+            "top 20": float(errors[order[:20]].min()),
+        }
+    return record

@@ -1,8 +1,8 @@
 """Measure the paper's tables and figures on a dataset, as Markdown and a picture.
 
     pip install 'curvireg_torch[paper]'
-    python scripts/paper/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR [--jobs N] [--page
-    docs/paper.md]
+    python scripts/paper/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR [--jobs N]
+        [--page docs/paper.md]
 
 TABLE is one of
 
@@ -22,8 +22,8 @@ TABLE is one of
 
 Every table states what was measured, the number of photographs, and 95 % intervals. Only objects
 that are neither occluded nor truncated are used, as in the paper. DIR/records holds one file for
-each mesh: an interrupted run goes on where it was, and a table is written as soon as all of its
-records are there. --page writes all tables that DIR holds, with the commit, into a page.
+each mesh: an interrupted run goes on where it was. --page writes all tables that DIR holds, with
+the commit, into a page.
 """
 
 import argparse
@@ -41,12 +41,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
 sys.path.insert(0, str(REPOSITORY))
 
-from curvireg_torch.errors import (
-    CurviregError,
-    InvalidInputError,
-    MissingDependencyError,
-    WorkerError,
-)
+from curvireg_torch.errors import CurviregError, MissingDependencyError, WorkerError
 from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.jobs.store import finite
@@ -106,70 +101,56 @@ def measure(
         found = measure_views(cases, settings, pose)
     seconds = (time.process_time() - start) / len(cases)
     same = {"cad": cases[0].mesh_path, "seconds": seconds, "commit": commit()}
-    names = [{"category": case.category, **same} for case in cases]
-    return [{**name, **record} for name, record in zip(names, found, strict=True)]
+    return [
+        {"category": case.category, **same, **record}
+        for case, record in zip(cases, found, strict=True)
+    ]
 
 
 def run(arguments: argparse.Namespace) -> None:
     check_packages()
-    origin = {"pixel_origin": arguments.pixel_origin, "limit": arguments.limit}
-    cases = find_cases(arguments.kind, arguments.root, **origin)
+    cases = find_cases(arguments.kind, arguments.root, limit=arguments.limit)
     settings = BankSettings(image_size=arguments.image_size)
-    pose = arguments.pose or DATASETS[arguments.kind].pose
-    wanted = TABLES if arguments.table == "all" else (arguments.table,)
     what = f"{arguments.root.name}, crops of {settings.image_size} px"
     for phase, makers in PHASES.items():
-        chosen = [name for name in makers if name in wanted]
+        chosen = [name for name in makers if arguments.table in ("all", name)]
         if not chosen:
             continue
-        records = collect(phase, cases, settings, pose, arguments)
-        if not records:
-            raise InvalidInputError(
-                f"{arguments.out}: holds no records of {phase} yet; run it without --partial"
-            )
+        records = paper.Records(collect(phase, cases, settings, arguments), what)
         for name in chosen:
-            for table in makers[name](paper.Records(records, what)):
+            for table in makers[name](records):
                 text = table.markdown()
                 write_file(arguments.out / f"{table.name}.md", text.encode())
                 print(text, flush=True)
             if name == "curve":
-                draw_curve(paper.Records(records, what), arguments.out / CURVE)
+                draw_curve(records, arguments.out / CURVE)
     if arguments.page is not None:
         write_page(arguments.out, arguments.page)
 
 
 def collect(
-    phase: str, cases: list[Case], settings: BankSettings, pose: str, arguments: argparse.Namespace
+    phase: str, cases: list[Case], settings: BankSettings, arguments: argparse.Namespace
 ) -> list[dict[str, Any]]:
     """The records of all cases; those of each mesh are stored when they are known."""
-    # In a fixed random order: the part that an interrupted run has measured is a fair one.
-    groups = sorted(
-        by_mesh(cases),
-        key=lambda group: text_digest(Path(group[0].mesh_path).name + group[0].category),
-    )
-    folder = arguments.out / "records"
-    paths = [
-        folder / f"{phase}-{request_of(phase, group, settings, pose)}.json" for group in groups
-    ]
-    missing = [(p, group) for p, group in zip(paths, groups, strict=True) if not p.exists()]
-    if not arguments.partial:
-        done = len(cases) - sum(len(group) for _, group in missing)
-        bar = tqdm(
-            total=len(cases), initial=done, desc=phase, unit="photo", disable=arguments.quiet
-        )
-        state = (phase, settings, pose)
-        with bar, Workers(arguments.jobs) as workers:
-            for (path, group), found in workers.map(
-                measure_groups, state, ([one] for one in missing)
-            ):
-                if isinstance(found, WorkerError):
-                    raise found
-                write_json(path, finite(found), indent=0)
-                bar.update(len(group))
-    return [record for path in paths if path.exists() for record in read_json(path)]
+    state = (phase, settings, DATASETS[arguments.kind].pose)
+    groups = {}
+    for group in by_mesh(cases):
+        path = arguments.out / "records" / f"{phase}-{request_of(group, *state)}.json"
+        groups[path] = group
+    missing = [(path, group) for path, group in groups.items() if not path.exists()]
+    done = len(cases) - sum(len(group) for _, group in missing)
+    bar = tqdm(total=len(cases), initial=done, desc=phase, unit="photo")
+    with bar, Workers(arguments.jobs) as workers:
+        blocks = ([task] for task in missing)
+        for (path, group), found in workers.map(measure_groups, state, blocks):
+            if isinstance(found, WorkerError):
+                raise found
+            write_json(path, finite(found), indent=0)
+            bar.update(len(group))
+    return [record for path in groups for record in read_json(path)]
 
 
-def request_of(phase: str, group: list[Case], settings: BankSettings, pose: str) -> str:
+def request_of(group: list[Case], phase: str, settings: BankSettings, pose: str) -> str:
     """Digest of all that the records of a mesh depend on."""
     own = [
         Path(__file__).with_name(name).read_text(encoding="utf-8")
@@ -237,21 +218,11 @@ def main() -> int:
     parser.add_argument(
         "--limit", type=int, metavar="N", help="use N photographs, spread evenly over the set"
     )
-    parser.add_argument(
-        "--partial", action="store_true", help="tables of what is measured so far; measures nothing"
-    )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
     parser.add_argument(
         "--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)"
     )
-    parser.add_argument(
-        "--pose", choices=("upright", "any"), help="corrected views (default: the dataset's)"
-    )
-    parser.add_argument(
-        "--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)"
-    )
     parser.add_argument("--page", type=Path, help="page of the documentation that gets the tables")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
     try:
         run(parser.parse_args())
     except CurviregError as error:

@@ -1,7 +1,7 @@
 """From the letter of the paper to the default pipeline, one change at a time.
 
     python scripts/paper/staircase.py pascal3d=/data/pascal3d_mini lm=/data/bop/lm --out DIR
-    [--limit N] [--jobs N] [--page PAGE]
+        [--limit N] [--jobs N] [--page PAGE]
 
 Each set is NAME=ROOT: ROOT is a PASCAL3D+ release if it has a folder ``CAD``, else a BOP set. Steps
 are cumulative. DIR/NAME/STEP holds what ``curvireg evaluate`` writes, which registers only what is
@@ -16,6 +16,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
@@ -41,9 +42,9 @@ RIGHT_DEG = 30.0
 FEWEST_CADS = 3  # for an interval
 
 
-@dataclass(frozen=True)
-class Step:
-    """One change: what it is, and how it turns the pipeline of the step before into its own."""
+class Step(NamedTuple):
+    """One change: what it is, and how it turns the pipeline of the step before into its own, for a
+    dataset of which the pose is known."""
 
     name: str
     change: Callable[[Pipeline, str], Pipeline]
@@ -89,12 +90,10 @@ def pipelines(pose: str) -> Iterator[tuple[str, Pipeline]]:
         yield f"{k}. {step.name}", pipeline
 
 
-def benchmark_of(root: Path, pixel_origin: int) -> Benchmark:
+def benchmark_of(root: Path) -> Benchmark:
     """The objects of a PASCAL3D+ release or a BOP set under the usual protocol."""
     if (root / "CAD").is_dir():
-        return Pascal3DBenchmark(
-            Pascal3DPlus(root, pixel_origin=pixel_origin), Protocol(pose="upright")
-        )
+        return Pascal3DBenchmark(Pascal3DPlus(root), Protocol(pose="upright"))
     return BOPBenchmark(BOPDataset(root), Protocol(pose="any"))
 
 
@@ -119,7 +118,7 @@ Scores = Mapping[int, Score]
 
 def climb(name: str, root: Path, options: argparse.Namespace) -> Scores:
     """Evaluate the steps of one set."""
-    benchmark = benchmark_of(root, options.pixel_origin)
+    benchmark = benchmark_of(root)
     entries = zip(benchmark.entries, benchmark.samples, strict=True)
     cads = {entry.key: str(sample[benchmark.mesh]) for entry, sample in entries}
     scores = {}
@@ -133,7 +132,6 @@ def climb(name: str, root: Path, options: argparse.Namespace) -> Scores:
             pipeline=pipeline,
             workers=Workers(options.jobs),
             limit=options.limit,
-            progress=not options.quiet,
         )
         if summary["skipped"]:
             print(f"staircase: {name}: left out: {dict(summary['skipped'])}", file=sys.stderr)
@@ -174,11 +172,7 @@ def main() -> int:
     )
     parser.add_argument("--steps", type=int, nargs="+", help="numbers of steps (default: all)")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
-    parser.add_argument(
-        "--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)"
-    )
     parser.add_argument("--page", type=Path, help="page of the documentation that gets the table")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
     options = parser.parse_args()
     sets = {}
     try:

@@ -23,7 +23,7 @@ from scripts._shared import commit, read_json
 from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
-from scripts.paper.measures import Estimate, bootstrap, points_within
+from scripts.paper.measures import Estimate, bootstrap, hausdorff_distance, share_near
 from tests._support import write_photo
 
 SETTINGS = BankSettings(image_size=64)
@@ -159,21 +159,6 @@ def test_focus_curves_by_threshold_and_precision_by_protocol(root):
     assert [row[0] for row in protocols.rows] == list(tables.PROTOCOLS)
 
 
-def test_a_mesh_is_rendered_once():
-    renderer = measure.Remembered(example_mesh())
-    renderer._inner = Mock(wraps=renderer._inner)
-    T = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
-    T[:, 2, 3] = torch.tensor([1.0, 2.0])
-    K, longer = (camera_matrix(f, f, 31.5, 31.5, dtype=torch.float64)[None] for f in (100.0, 120.0))
-    first = renderer.render(T, K, (64, 64))
-    assert torch.equal(renderer.render(T, K, (64, 64)), first)
-    assert renderer._inner.render.call_count == 1
-    for other in ((T.flip(0), K, (64, 64)), (T, longer, (64, 64)), (T, K, (32, 32))):
-        assert not torch.equal(renderer.render(*other), first)
-    assert not torch.equal(renderer.render(T, K, (64, 64), orthographic=True), first)
-    assert renderer._inner.render.call_count == 5
-
-
 def test_bootstrap_resamples_cads():
     values = [0.0] * 10 + [1.0] * 10
     alone = bootstrap(values, [str(i) for i in range(20)])
@@ -190,9 +175,18 @@ def test_points_within_a_radius():
     photo = torch.zeros(9, 9, dtype=torch.bool)
     view = torch.zeros(9, 9, dtype=torch.bool)
     photo[4, 4] = photo[4, 8] = view[4, 1] = True
-    assert points_within(photo, view, (2.0, 3.0, 7.0)) == [0.0, 0.5, 1.0]
-    assert points_within(photo, torch.zeros_like(view), (9.0,)) == [0.0]
-    assert np.isnan(points_within(torch.zeros_like(photo), view, (9.0,))[0])
+    assert [share_near(photo, view, eps_px=eps) for eps in (2.0, 3.0, 7.0)] == [0.0, 0.5, 1.0]
+    assert share_near(photo, torch.zeros_like(view), eps_px=9.0) == 0.0
+    assert np.isnan(share_near(torch.zeros_like(photo), view, eps_px=9.0))
+
+
+def test_the_hausdorff_distance_is_that_of_the_farthest_point():
+    photo = torch.zeros(9, 9, dtype=torch.bool)
+    view = photo.clone()
+    photo[4, 4] = photo[4, 8] = view[1, 4] = True
+    assert hausdorff_distance(photo, view) == hausdorff_distance(view, photo) == 5.0
+    assert hausdorff_distance(photo, torch.zeros_like(view)) == math.inf
+    assert np.isnan(hausdorff_distance(torch.zeros_like(view), torch.zeros_like(view)))
 
 
 def test_printed_numbers_are_the_means_of_the_papers_rows():
@@ -221,11 +215,11 @@ ERRORS = [[float(x.rstrip("°cm")) for x in row] for row in printed.POSE_ERRORS.
 @pytest.mark.parametrize(
     ("label", "found"),
     [
-        ("DTLSampleIP", printed._rows(printed._WEB_IP, 1)),
-        ("IPPASCAL3D", printed._rows(printed._IP, 1)),
-        ("DTLSampleHD", printed._rows(printed._WEB_HAUSDORFF, 1)),
-        ("HDPASCAL3D", printed._rows(printed._HAUSDORFF, 1)),
-        ("HDPASCAL3D2", printed._rows(printed._PRECISION, 1)),
+        ("DTLSampleIP", printed.TABLES["web_ip"]),
+        ("IPPASCAL3D", list(printed.TABLES["ip"].values())),
+        ("DTLSampleHD", printed.TABLES["web_hausdorff"]),
+        ("HDPASCAL3D", list(printed.TABLES["hausdorff"].values())),
+        ("HDPASCAL3D2", list(printed.TABLES["precision"].values())),
         ("AErrorAngles", ERRORS),
     ],
 )
@@ -270,7 +264,6 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
         tmp_path,
         "--image-size",
         "64",
-        "--quiet",
         "--page",
         page,
     ]
@@ -281,11 +274,10 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     assert f"Measured at commit {commit()}." in page.read_text()
     (record,) = (tmp_path / "records").iterdir()
     assert len(json.loads(record.read_text())) == 2
-    assert run(monkeypatch, "precision", *words[1:], "--partial") == 2  # no records of views
     monkeypatch.setattr(
         reproduce_paper, "measure", Mock(side_effect=AssertionError("measured again"))
     )
-    assert run(monkeypatch, *words, "--partial") == 0
+    assert run(monkeypatch, *words) == 0
     assert run(monkeypatch, "curve", *words[1:]) == 0
     assert (tmp_path / reproduce_paper.CURVE).stat().st_size > 1000
     assert "(images/paper-curve.webp)" in page.read_text()
@@ -347,7 +339,7 @@ def climb(monkeypatch, out, *words):
 
 
 def test_steps_are_evaluated_once(pascal, tmp_path, monkeypatch, capsys):
-    words = [f"mini={pascal.root}", "--quiet", "--steps", "0"]
+    words = [f"mini={pascal.root}", "--steps", "0"]
     assert climb(monkeypatch, tmp_path, *words) == 0
     output = capsys.readouterr()
     assert "unreadable_image" in output.err
@@ -374,7 +366,7 @@ def test_objects_without_a_pose_count_as_wrong(pascal, tmp_path, monkeypatch, ca
             "c": {"symmetric_error_deg": math.nan, "error_deg": 5.0},
         }
     )
-    keys = [entry.key for entry in staircase.benchmark_of(pascal.root, 1).entries]
+    keys = [entry.key for entry in staircase.benchmark_of(pascal.root).entries]
     found.errors = dict(zip(keys, found.errors.values(), strict=False))
     monkeypatch.setattr(staircase, "evaluate", lambda *_, **__: {"skipped": {}})
     monkeypatch.setattr(staircase, "read_run", lambda _: found)
