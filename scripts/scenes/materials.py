@@ -72,35 +72,41 @@ def random_picture(rng: Rng, size: int) -> Array:
         noise = np.zeros((size, size, 3), np.float32)
         slope = rng.uniform(0.2, 1.0)
         for octave in range(1, 8):
-            cells = rng.normal(size=(2**octave, 2**octave, 1)) + rng.normal(
-                0, 0.3, (2**octave, 2**octave, 3)
-            )
-            layer = cv2.resize(
-                cells.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC
-            )
+            n = 2**octave
+            grey = rng.normal(size=(n, n, 1))
+            cells = (grey + rng.normal(0, 0.3, (n, n, 3))).astype(np.float32)
+            layer = cv2.resize(cells, (size, size), interpolation=cv2.INTER_CUBIC)
             noise += layer * 2 ** (-slope * octave)
         noise /= noise.std() + 1e-6
-        picture = picture + rng.uniform(0.05, 0.35) * (noise if kind == 1 else np.tanh(4 * noise))
-    elif kind in (3, 4):  # shapes and lines
+        if kind == 2:
+            noise = np.tanh(4 * noise)
+        picture = picture + rng.uniform(0.05, 0.35) * noise
+    elif kind in (3, 4):
         picture = np.ascontiguousarray(picture)
         for _ in range(int(rng.integers(3, 40 if kind == 3 else 120))):
-            colour = tuple(float(c) for c in random_colour(rng))
-            x, y = rng.integers(0, size, 2).tolist()
-            reach = rng.uniform(0.02, 0.4) * size
-            if rng.random() < 0.3:
-                end = rng.integers(0, size, 2).tolist()
-                cv2.line(picture, (x, y), end, colour, int(rng.integers(1, 5)), cv2.LINE_AA)
-            elif rng.random() < 0.5:
-                corners = np.asarray([x, y]) + rng.normal(0, reach, (int(rng.integers(3, 6)), 2))
-                cv2.fillConvexPoly(
-                    picture, cv2.convexHull(corners.astype(np.int32)), colour, cv2.LINE_AA
-                )
-            else:
-                a, b = rng.uniform(0.2, 1, 2) * reach
-                axes = (int(a) + 1, int(b) + 1)
-                angle = float(rng.uniform(0, 180))
-                cv2.ellipse(picture, (x, y), axes, angle, 0, 360, colour, -1, cv2.LINE_AA)
+            _draw_shape(picture, rng)
     return np.ascontiguousarray(np.clip(picture, 0, 1), dtype=np.float32)
+
+
+def _draw_shape(picture: Array, rng: Rng) -> None:
+    """A line, a convex polygon, or an ellipse."""
+    size = len(picture)
+    colour = random_colour(rng).tolist()
+    place = rng.integers(0, size, 2).tolist()
+    reach = rng.uniform(0.02, 0.4) * size
+    if rng.random() < 0.3:
+        end = rng.integers(0, size, 2).tolist()
+        cv2.line(picture, place, end, colour, int(rng.integers(1, 5)), cv2.LINE_AA)
+    elif rng.random() < 0.5:
+        count = int(rng.integers(3, 6))
+        corners = np.array(place) + rng.normal(0, reach, (count, 2))
+        hull = cv2.convexHull(corners.astype(np.int32))
+        cv2.fillConvexPoly(picture, hull, colour, cv2.LINE_AA)
+    else:
+        a, b = rng.uniform(0.2, 1, 2) * reach
+        axes = (int(a) + 1, int(b) + 1)
+        angle = float(rng.uniform(0, 180))
+        cv2.ellipse(picture, place, axes, angle, 0, 360, colour, -1, cv2.LINE_AA)
 
 
 def random_texture(rng: Rng, size: int = 256) -> Array:
@@ -116,12 +122,11 @@ def random_texture(rng: Rng, size: int = 256) -> Array:
         threads = 2 * int(rng.integers(12, 32))
         stripes = int(rng.integers(1, 6))
         weave = 0.5 + 0.5 * np.sin(2 * np.pi * threads * x) * np.sin(2 * np.pi * threads * y)
-        bands = (
-            np.sin(2 * np.pi * stripes * x)
-            * (np.sin(2 * np.pi * stripes * y) if rng.random() < 0.5 else 1.0)
-            > 0
-        )
-        colour = np.where(bands[..., None], first, second) * (0.75 + 0.25 * weave[..., None])
+        bands = np.sin(2 * np.pi * stripes * x)
+        if rng.random() < 0.5:
+            bands = bands * np.sin(2 * np.pi * stripes * y)
+        colour = np.where(bands[..., None] > 0, first, second)
+        colour = colour * (0.75 + 0.25 * weave[..., None])
         return np.ascontiguousarray(colour, dtype=np.float32)
     grain = np.zeros((size, size), np.float32)  # boards with a grain along the columns
     for rows, columns, strength in ((8, 2, 0.5), (64, 4, 0.5), (size // 2, 16, 0.3)):
@@ -132,10 +137,10 @@ def random_texture(rng: Rng, size: int = 256) -> Array:
         grain += strength * fine[high : high + size, wide : wide + size]
     grain += rng.normal(0, 0.5, 4)[np.floor(4 * y).astype(int)]
     gap = np.abs(4 * y - np.round(4 * y)) < 0.012
-    colour = rng.uniform(0.4, 1.6) * np.array([0.42, 0.25, 0.13]) * np.exp(0.16 * grain[..., None])
-    return np.ascontiguousarray(
-        np.where(gap[..., None], 0.35 * colour, colour).clip(0, 1), dtype=np.float32
-    )
+    brown = rng.uniform(0.4, 1.6) * np.array([0.42, 0.25, 0.13])
+    colour = brown * np.exp(0.16 * grain[..., None])
+    colour = np.where(gap[..., None], 0.35 * colour, colour)
+    return np.ascontiguousarray(colour.clip(0, 1), dtype=np.float32)
 
 
 def random_rotation(rng: Rng) -> Array:

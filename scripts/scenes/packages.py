@@ -58,31 +58,38 @@ def solid_of_revolution(rng: Rng) -> tuple[np.ndarray, ...]:
             (neck, 1.0),
             (0.0, 1.0),
         ]
-    r, z = np.array(profile).T
-    v = np.concatenate([[0.0], np.hypot(np.diff(r), np.diff(z)).cumsum()])
-    angle = np.linspace(0.0, 2.0 * np.pi, SIDES + 1)
+    steps = np.diff(np.array(profile), axis=0)
+    along = np.append(0.0, np.hypot(steps[:, 0], steps[:, 1]).cumsum())
+    around = SIDES + 1  # the first side is also the last
+    angle = np.linspace(0.0, 2.0 * np.pi, around)
     ring = np.stack([np.sin(angle), -np.cos(angle)], axis=1)
-    points = [np.c_[radius_ * ring, np.full(SIDES + 1, height)] for radius_, height in profile]
-    uv = [np.c_[angle / (2.0 * np.pi), np.full(SIDES + 1, height)] for height in v / v[-1]]
-    k = np.arange(SIDES)
+    points = []
+    uv = []
     faces = []
-    for below in range(len(profile) - 1):
-        a = below * (SIDES + 1) + k
-        b = a + SIDES + 1
-        faces += [np.c_[a, a + 1, b + 1], np.c_[a, b + 1, b]]
+    for level, (r, z) in enumerate(profile):
+        points.append(np.c_[r * ring, np.full(around, z)])
+        v = along[level] / along[-1]
+        uv.append(np.c_[angle / (2.0 * np.pi), np.full(around, v)])
+        if level:
+            b = level * around + np.arange(SIDES)
+            a = b - around
+            faces.append(np.c_[a, a + 1, b + 1])
+            faces.append(np.c_[a, b + 1, b])
     return np.concatenate(points), np.concatenate(faces), np.concatenate(uv)
 
 
 def carton(rng: Rng) -> tuple[np.ndarray, ...]:
     """Vertices, faces and texture coordinates of a box of height 1, with another part of the label
     on each side."""
-    solid = trimesh.creation.box((rng.uniform(0.3, 0.9), rng.uniform(0.15, 0.6), 1.0))
+    width = rng.uniform(0.3, 0.9)
+    depth = rng.uniform(0.15, 0.6)
+    solid = trimesh.creation.box((width, depth, 1.0))
     corners = solid.triangles.reshape(6, 6, 3)  # two triangles a side
     uv = np.zeros((6, 6, 2))
     for k, side in enumerate(corners):
-        flat = np.argsort(np.ptp(side, axis=0))[1:]
-        flat.sort()
-        inside = (side[:, flat] - side[:, flat].min(axis=0)) / np.ptp(side[:, flat], axis=0)
+        axes = np.sort(np.argsort(np.ptp(side, axis=0))[1:])
+        flat = side[:, axes]
+        inside = (flat - flat.min(axis=0)) / np.ptp(flat, axis=0)
         uv[k] = (np.array([k % 3, k // 3]) + inside) / (3.0, 2.0)
     return corners.reshape(-1, 3), np.arange(36).reshape(-1, 3), uv.reshape(-1, 2)
 
@@ -93,6 +100,7 @@ def package(rng: Rng, print_rng: Rng | None = None) -> TexturedMesh:
     vertices, faces, uv = carton(rng) if rng.random() < 0.3 else solid_of_revolution(rng)
     picture = label(rng)
     height = rng.uniform(0.08, 0.25)
-    picture = picture if print_rng is None else label(print_rng)
+    if print_rng is not None:
+        picture = label(print_rng)
     linear = (picture.astype(np.float32) / 255) ** 2.2
     return TexturedMesh.from_arrays(vertices * height, faces, [Texture(linear, 0.3)], uv=uv)

@@ -12,8 +12,12 @@ import cv2
 import numpy as np
 import torch
 
-from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
-from curvireg_torch.geometry.cameras import rotation_towards
+from curvireg_torch.geometry import (
+    rotation_from_axis_angle,
+    rotation_from_viewpoint,
+    rotation_towards,
+    transform,
+)
 from curvireg_torch.geometry.framing import outside_fraction
 from scripts.scenes.light import Light, random_light
 from scripts.scenes.materials import random_picture, random_rotation
@@ -66,17 +70,20 @@ def single(
     front of it."""
     turn = np.eye(3) if upright else random_rotation(rng)
     target = Placed.standing(mesh, turn, 1.0 / mesh.radius, obj_id=obj_id)
+    hull = target.hull
     fill = rng.uniform(0.25, 0.65) * min(size)
     elevation = float(rng.choice([rng.uniform(-4, 25), rng.uniform(5, 60)]))
     azimuth = rng.uniform(0, 360)
-    view = look_at(target.hull, size, rng, fill=fill, azimuth=azimuth, elevation=elevation)
+    view = look_at(hull, size, rng, fill=fill, azimuth=azimuth, elevation=elevation)
     R, t, _ = view
     eye = -R.T @ t
     shapes = [target]
     if eye[2] > 0.05 and rng.random() < 0.9:
-        shapes += _room(textures, eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9), rng)
-    reach = float(np.linalg.norm(target.hull[:, :2], axis=1).max())
-    shapes += _clutter(clutter, 0.8 * reach, eye, int(rng.choice([0, 1, 3, 5])), occluded, rng)
+        towards_camera = eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9)
+        shapes += _room(textures, towards_camera, rng)
+    reach = 0.8 * float(np.linalg.norm(hull[:, :2], axis=1).max())
+    count = int(rng.choice([0, 1, 3, 5]))
+    shapes += _clutter(clutter, reach, eye, count, occluded, rng)
     return _lit(shapes, view, target.hull, cameras, rng)
 
 
@@ -110,11 +117,11 @@ def shelf(
             obj_id, mesh = meshes[int(k)]
             row = n % 2  # front, back
             turn = rotation(2, np.radians(rng.normal(0, 35)))
-            item = Placed.standing(mesh, turn, 1.0 / unit, obj_id=obj_id)
-            low = item.hull.min(axis=0)
-            high = item.hull.max(axis=0)
-            half = 0.5 * (high - low)[0]
-            gap = rng.uniform(0.02, 0.2 + 1.2 * (1.0 - occlusion) * (1 - row))
+            hull = Placed.standing(mesh, turn, 1.0 / unit).hull
+            high = hull.max(axis=0)
+            half = 0.5 * (high - hull.min(axis=0))[0]
+            room = 1.2 * (1.0 - occlusion) * (1 - row)
+            gap = rng.uniform(0.02, 0.2 + room)
             x = edge[row] + half + gap
             y = 1.6 * row + rng.uniform(-0.15, 0.15)
             edge[row] = x + half
@@ -123,7 +130,8 @@ def shelf(
             shapes.append(Placed.standing(mesh, turn, 1.0 / unit, at, obj_id=obj_id))
         board_height += tallest + rng.uniform(0.3, 0.8)
     points = np.concatenate([shape.hull for shape in shapes])
-    (x0, _, _), (x1, _, top) = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
+    x0, _, _ = points.min(axis=0) - 0.3
+    x1, _, top = points.max(axis=0) + 0.3
     wood = Texture(textures(rng))
     front = -1.2
     back = 3.0
@@ -131,7 +139,8 @@ def shelf(
         board = [(x0, front, z), (x1, front, z), (x1, back, z), (x0, back, z)]
         under = z - 0.12
         rim = [(x0, front, under), (x1, front, under), (x1, front, z), (x0, front, z)]
-        shapes += [_quad(board, wood), _quad(rim, wood)]
+        shapes.append(_quad(board, wood))
+        shapes.append(_quad(rim, wood))
     wall = [(x0, back, -1), (x1, back, -1), (x1, back, top), (x0, back, top)]
     shapes.append(_quad(wall, Texture(textures(rng))))
     fill = rng.uniform(0.7, 1.0) * max(size)
@@ -147,11 +156,13 @@ def look_at(
     """A view whose box around points (P, 3) is ``fill`` px long and lies near the middle; angles in
     degrees."""
     H, W = size
-    focal = 0.5 * max(H, W) / np.tan(np.radians(rng.uniform(22, 60)) / 2)
+    sides = np.array([W, H])
+    field_of_view = np.radians(rng.uniform(22, 60))
+    focal = 0.5 * max(H, W) / np.tan(field_of_view / 2)
     K = np.array([[focal, 0, (W - 1) / 2], [0, focal, (H - 1) / 2], [0, 0, 1.0]])
-    free = np.clip(0.5 - 0.5 * fill / np.array([W, H]), 0.0, 0.12)
-    pixel = np.array([*(np.array([W, H]) * (0.5 + free * rng.uniform(-1, 1, 2))), 1.0])
-    ray = np.linalg.inv(K) @ pixel
+    free = np.clip(0.5 - 0.5 * fill / sides, 0.0, 0.12)
+    x, y = sides * (0.5 + free * rng.uniform(-1, 1, 2))
+    ray = np.linalg.inv(K) @ (x, y, 1.0)
     ray /= np.linalg.norm(ray)
     R = rotation_towards(torch.from_numpy(ray)).numpy()
     R = R @ rotation_from_viewpoint(azimuth, elevation, rng.normal(0, 4)).numpy()
@@ -160,8 +171,11 @@ def look_at(
     distance = 4.0 * nearest
     for _ in range(12):
         placed = (points - middle) @ R.T + distance * ray
-        flat = placed[:, :2] / np.maximum(placed[:, 2:], 0.05) * focal
-        distance *= np.ptp(flat, axis=0).max() / fill if placed[:, 2].min() > 0.05 else 1.5
+        if placed[:, 2].min() > 0.05:
+            flat = placed[:, :2] / placed[:, 2:] * focal
+            distance *= np.ptp(flat, axis=0).max() / fill
+        else:
+            distance *= 1.5
         distance = max(distance, nearest)
     return R, distance * ray - R @ middle, K
 
@@ -176,25 +190,29 @@ def cut(view: View, points: Array, size: tuple[int, int], fraction: float, rng: 
     middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
     reach = np.ptp(pixels, axis=0)
     side = rng.choice([-1.0, 0.0, 1.0], 2)
-    side = side if side.any() else np.array([rng.choice([-1.0, 1.0]), 0.0])
+    if not side.any():
+        side[0] = rng.choice([-1.0, 1.0])
     border = np.where(side > 0, [W - 0.5, H - 0.5], -0.5)
     hull = torch.from_numpy(points)
+    to_ray = np.linalg.inv(K)
     low = -0.6
     high = 0.6
     for _ in range(20):
         part = 0.5 * (low + high)
         target = np.where(side == 0, middle, border + side * part * reach)
-        turn = _turn_to(np.linalg.inv(K) @ (*middle, 1.0), np.linalg.inv(K) @ (*target, 1.0))
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3], pose[:3, 3] = torch.from_numpy(turn @ R), torch.from_numpy(turn @ t)
-        too_little = outside_fraction(hull, pose, torch.from_numpy(K), size) < fraction
-        low, high = (part, high) if too_little else (low, part)
+        turn = _turn_to(to_ray @ (*middle, 1.0), to_ray @ (*target, 1.0))
+        pose = transform(torch.from_numpy(turn @ R), torch.from_numpy(turn @ t))
+        if outside_fraction(hull, pose, torch.from_numpy(K), size) < fraction:
+            low = part
+        else:
+            high = part
     return turn @ R, turn @ t, K
 
 
 def _turn_to(ray: Array, target: Array) -> Array:
     """(3, 3) rotation from one ray to another."""
-    first, second = (rotation_towards(torch.from_numpy(one)).numpy() for one in (ray, target))
+    first = rotation_towards(torch.from_numpy(ray)).numpy()
+    second = rotation_towards(torch.from_numpy(target)).numpy()
     return second @ first.T
 
 
@@ -208,10 +226,10 @@ def _rig(view: View, points: Array, cameras: int, rng: Rng) -> list[View]:
     for k in range(1, cameras):
         side = k % 2
         angle[side] += rng.uniform(*RIG_STEP)
-        tilt = rng.normal(0, 3, 2)
-        turn = _rotation(np.array([*tilt, (1 - 2 * side) * angle[side]]))
+        x, y = rng.normal(0, 3, 2)
+        turned = R @ _rotation(x, y, (1 - 2 * side) * angle[side])
         place = (R @ middle + t) * rng.uniform(0.85, 1.15)
-        views.append((R @ turn, place - R @ turn @ middle, K))
+        views.append((turned, place - turned @ middle, K))
     return views
 
 
@@ -227,27 +245,33 @@ def camera_path(view: View, middle: Array, count: int, rng: Rng) -> list[View]:
     pull = np.array([0.0, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03])
 
     def pose(state: Array) -> tuple[Array, Array]:
-        azimuth, small, (distance, u, v) = state[0], state[1:4], state[4:]
+        azimuth, x, y, z, distance, u, v = state
         ray = centre / centre[2] + np.linalg.inv(K) @ (u, v, 0.0)
         place = ray / np.linalg.norm(ray) * np.linalg.norm(centre) * np.exp(distance)
-        return _rotation(small) @ R @ _rotation(np.array([0.0, 0.0, azimuth])), place
+        return _rotation(x, y, z) @ R @ _rotation(0.0, 0.0, azimuth), place
 
     state = np.zeros(7)
     velocity = np.zeros(7)
     path = [pose(state)]
     while len(path) < count:
         velocity = 0.9 * velocity + rng.normal(0, acceleration) - pull * state
-        (R0, p0), (R1, p1) = path[-1], pose(state + velocity)
-        turn = np.degrees(np.arccos(np.clip(0.5 * (np.trace(R0.T @ R1) - 1.0), -1, 1)))
-        shift = np.linalg.norm(p1 - p0) / np.linalg.norm(p0)
-        velocity *= min(1.0, 0.98 * MAX_TURN / max(turn, 1e-9), 0.98 * MAX_SHIFT / max(shift, 1e-9))
+        R0, place0 = path[-1]
+        R1, place1 = pose(state + velocity)
+        cosine = 0.5 * (np.trace(R0.T @ R1) - 1.0)
+        turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        shift = np.linalg.norm(place1 - place0) / np.linalg.norm(place0)
+        by_turn = 0.98 * MAX_TURN / max(turn, 1e-9)
+        by_shift = 0.98 * MAX_SHIFT / max(shift, 1e-9)
+        velocity *= min(1.0, by_turn, by_shift)
         state = state + velocity
         path.append(pose(state))
     return [(turn, place - turn @ middle, K) for turn, place in path]
 
 
-def _rotation(degrees: Array) -> Array:
-    return rotation_from_axis_angle(torch.from_numpy(np.radians(degrees))).numpy()
+def _rotation(x: float, y: float, z: float) -> Array:
+    """By an axis times an angle in degrees."""
+    vector = np.radians(np.array([x, y, z]))
+    return rotation_from_axis_angle(torch.from_numpy(vector)).numpy()
 
 
 def _quad(corners: list[tuple[float, ...]], paint: Texture, repeats: float = 1.0) -> Placed:
@@ -262,7 +286,8 @@ def _room(textures: Callable[[Rng], Array], toward: Array, rng: Rng) -> list[Pla
     the camera."""
     r = float(rng.choice([3.0, 8.0, 40.0]))
     floor = [(-r, -r, 0.0), (r, -r, 0.0), (r, r, 0.0), (-r, r, 0.0)]
-    surfaces = [_quad(floor, Texture(textures(rng)), r / rng.uniform(0.5, 3.0))]
+    paint = Texture(textures(rng))
+    surfaces = [_quad(floor, paint, r / rng.uniform(0.5, 3.0))]
     for _ in range(int(rng.choice([0, 1, 1, 2]))):
         back = -toward + rng.normal(0, 0.5, 2)
         back = back / np.linalg.norm(back)
@@ -272,7 +297,8 @@ def _room(textures: Callable[[Rng], Array], toward: Array, rng: Rng) -> list[Pla
         a = back * far - 12 * side
         b = back * far + 12 * side
         wall = [(*a, 0.0), (*b, 0.0), (*b, high), (*a, high)]
-        surfaces.append(_quad(wall, Texture(textures(rng)), 12 / rng.uniform(0.7, 4.0)))
+        paint = Texture(textures(rng))
+        surfaces.append(_quad(wall, paint, 12 / rng.uniform(0.7, 4.0)))
     return surfaces
 
 
@@ -285,20 +311,24 @@ def _clutter(
     for k in range(count + occluder):
         mesh = draw(rng)
         front = k >= count
-        scale = float(np.exp(rng.uniform(-0.9, 0.4))) * (0.6 if front else 1.0) / mesh.radius
-        turn = _rotation(np.array([0.0, 0.0, rng.uniform(0, 360)]))
+        size = float(np.exp(rng.uniform(-0.9, 0.4)))
+        scale = size * (0.6 if front else 1.0) / mesh.radius
+        turn = _rotation(0.0, 0.0, rng.uniform(0, 360))
         if rng.random() < 0.15:
             turn = random_rotation(rng)
         radius = 0.5 * scale * float(np.linalg.norm(np.ptp(mesh.hull, axis=0)[:2]))
         if front:
-            direction = eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9)
-            aside = np.array([-direction[1], direction[0]]) * rng.uniform(-0.8, 0.8)
-            place = direction * (reach + radius + rng.uniform(0.05, 0.4)) + aside
+            x, y = eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9)
+            aside = np.array([-y, x]) * rng.uniform(-0.8, 0.8)
+            far = reach + radius + rng.uniform(0.05, 0.4)
+            place = np.array([x, y]) * far + aside
+            free = 0.6
         else:
             direction = unit_circle(rng.uniform(0, 2 * np.pi))
             place = direction * (reach + radius + rng.exponential(0.7))
+            free = 1.0
         # not around the camera
-        if np.linalg.norm(eye[:2] - place) > radius + (0.6 if front else 1.0):
+        if np.linalg.norm(eye[:2] - place) > radius + free:
             clutter.append(Placed.standing(mesh, turn, scale, (*place, 0.0)))
     return clutter
 
@@ -310,7 +340,8 @@ def simulate_camera(picture: Array, rng: Rng) -> Array:
     ``picture`` is (H, W, 3) float32 linear light; the result is uint8.
     """
     height, width = picture.shape[:2]
-    gain = rng.uniform(0.45, 0.75) / (np.percentile(picture, rng.uniform(60, 95)) + 1e-3)
+    bright = rng.uniform(0.45, 0.75)
+    gain = bright / (np.percentile(picture, rng.uniform(60, 95)) + 1e-3)
     picture = picture * gain * (1 + rng.normal(0, 0.06, 3))
     picture = np.clip(picture, 0, 1) ** rng.uniform(0.5, 1.1)
     if rng.random() < 0.15:
@@ -321,14 +352,16 @@ def simulate_camera(picture: Array, rng: Rng) -> Array:
     if rng.random() < 0.1:  # motion blur
         length = int(rng.integers(3, 8))
         kernel = np.zeros((length, length), np.float32)
-        cv2.line(kernel, (length // 2, length // 2), rng.integers(0, length, 2).tolist(), 1.0)
+        end = rng.integers(0, length, 2).tolist()
+        cv2.line(kernel, (length // 2, length // 2), end, 1.0)
         picture = cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
     if rng.random() < 0.35:  # low resolution
         scale = rng.uniform(0.35, 0.9)
         size = (int(width * scale), int(height * scale))
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
         picture = cv2.resize(picture, (width, height))
-    picture = picture + rng.normal(0, np.exp(rng.uniform(-6.5, -3.0)), picture.shape)
+    noise = np.exp(rng.uniform(-6.5, -3.0))
+    picture = picture + rng.normal(0, noise, picture.shape)
     coded = (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)
     if rng.random() < 0.6:
         quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(30, 96))]

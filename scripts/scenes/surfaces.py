@@ -1,6 +1,5 @@
 """Elementary surfaces that shapes are built from."""
 
-from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -69,19 +68,20 @@ def grid(points: Array, *, caps: bool = True) -> Surface:
     """Triangles between the rows of (M, N, 3) points, which are closed; ``caps`` closes the
     ends."""
     m, n = points.shape[:2]
-    i, j = np.mgrid[: m - 1, :n]
+    i, j = np.mgrid[: m - 1, :n].reshape(2, -1)
     a = i * n + j
     b = i * n + (j + 1) % n
     c = a + n
     d = b + n
-    faces = [np.stack(corners, -1).reshape(-1, 3) for corners in ((a, b, d), (a, d, c))]
+    faces = [np.stack([a, b, d], -1), np.stack([a, d, c], -1)]
     vertices = points.reshape(-1, 3)
     if caps:
         ring = np.arange(n)
-        last = (m - 1) * n
         following = (ring + 1) % n
-        faces.append(np.stack([following, ring, np.full(n, m * n)], -1))
-        faces.append(np.stack([last + ring, last + following, np.full(n, m * n + 1)], -1))
+        last = (m - 1) * n
+        low = np.full(n, m * n)
+        faces.append(np.stack([following, ring, low], -1))
+        faces.append(np.stack([last + ring, last + following, low + 1], -1))
         vertices = np.concatenate([vertices, points[[0, -1]].mean(axis=1)])
     return Surface(vertices, np.concatenate(faces))
 
@@ -131,8 +131,9 @@ def superquadric(size: ArrayLike, roundness: tuple[float, float]) -> Surface:
     v = np.linspace(-0.5, 0.5, AROUND // 2 + 1) * np.pi
     ring = _power(_circle(), roundness[1])
     level = _power(unit_circle(v), roundness[0])
+    flat = level[:, :1, None] * ring
     height = np.broadcast_to(level[:, 1:, None], (len(v), AROUND, 1))
-    points = np.concatenate([level[:, :1, None] * ring, height], -1)
+    points = np.concatenate([flat, height], -1)
     return grid(points, caps=False).moved(scale=size)
 
 
@@ -160,11 +161,6 @@ def bar(start: ArrayLike, end: ArrayLike, radius: float, *, sides: int = 10) -> 
     frame = np.stack([side, np.cross(axis, side)])
     ring = radius * unit_circle(2 * np.pi * (np.arange(sides) + 0.5) / sides) @ frame
     return grid(np.stack([a + ring, b + ring]))
-
-
-def tube(path: Array, radius: float) -> Surface:
-    """Rods along a (N, 3) path."""
-    return join([bar(a, b, radius) for a, b in pairwise(path)])
 
 
 def join(surfaces: list[Surface]) -> Surface:

@@ -19,6 +19,22 @@ from scripts.scenes.surfaces import Array, Rng
 MAX_TEXTURE = 512
 SUPERSAMPLING = 1.25
 MAX_REPEATS = 4  # of a texture that an exported atlas keeps
+PLY_HEADER = """ply
+format binary_little_endian 1.0
+comment TextureFile {stem}.png
+element vertex {vertices}
+property float x
+property float y
+property float z
+property float nx
+property float ny
+property float nz
+property float texture_u
+property float texture_v
+element face {faces}
+property list uchar int vertex_indices
+end_header
+"""
 
 
 class Paint(Protocol):
@@ -76,10 +92,10 @@ class TexturedMesh:
     def __post_init__(self) -> None:
         if self.hull is None:
             points = self.triangles.reshape(-1, 3)
-            flat = np.linalg.matrix_rank(points - points[0], tol=1e-6 * np.abs(points).max()) < 3
-            object.__setattr__(
-                self, "hull", points if flat else points[ConvexHull(points).vertices]
-            )
+            tolerance = 1e-6 * np.abs(points).max()
+            if np.linalg.matrix_rank(points - points[0], tol=tolerance) == 3:
+                points = points[ConvexHull(points).vertices]
+            object.__setattr__(self, "hull", points)
 
     @classmethod
     def from_arrays(
@@ -89,13 +105,9 @@ class TexturedMesh:
         corners = np.asarray(vertices, float)[faces]
         normals = np.repeat(face_normals(corners)[:, None], 3, axis=1)
         uv = np.zeros((*faces.shape, 2)) if uv is None else np.asarray(uv)[faces]
-        return cls(
-            corners,
-            normals,
-            uv,
-            np.zeros(len(faces), int) if paint is None else paint,
-            tuple(paints),
-        )
+        if paint is None:
+            paint = np.zeros(len(faces), int)
+        return cls(corners, normals, uv, paint, tuple(paints))
 
     @classmethod
     def load(cls, path: Path) -> "TexturedMesh":
@@ -105,35 +117,14 @@ class TexturedMesh:
             warnings.simplefilter("ignore", RuntimeWarning)  # faces without texture coordinates
             loaded = trimesh.load(path, process=False)
         parts = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
-        columns = ([], [], [], [])
-        paints = []
-        for number, part in enumerate(
-            p for p in parts if isinstance(p, trimesh.Trimesh) and len(p.faces)
-        ):
-            faces = np.asarray(part.faces)
-            corners = np.asarray(part.vertices)[faces]
-            normals = part._cache.cache.get("vertex_normals")
-            uv = getattr(part.visual, "uv", None)
-            flat = np.repeat(face_normals(corners)[:, None], 3, axis=1)
-            columns[0].append(corners)
-            columns[1].append(flat if normals is None else np.asarray(normals)[faces])
-            columns[2].append(np.zeros((*faces.shape, 2)) if uv is None else np.asarray(uv)[faces])
-            columns[3].append(np.full(len(faces), number))
-            material = getattr(part.visual, "material", None)
-            image = getattr(material, "image", None) if uv is not None else None
-            diffuse = (
-                np.asarray(getattr(material, "diffuse", [160, 160, 160, 255]), float)[:3] / 255
-            )
-            picture = (
-                (np.clip(diffuse, 0.01, 1) ** 2.2)[None, None]
-                if image is None
-                else linear_texture(image)
-            )
-            gloss = (
-                np.asarray(getattr(material, "specular", [0, 0, 0, 255]), float)[:3].mean() / 255
-            )
-            paints.append(Texture(picture.astype(np.float32), float(gloss)))
-        return cls(*(np.concatenate(c) for c in columns), tuple(paints))
+        parts = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+        counts = [len(part.faces) for part in parts]
+        columns = zip(*map(columns_of, parts), strict=True)
+        return cls(
+            *map(np.concatenate, columns),
+            paint=np.repeat(np.arange(len(parts)), counts),
+            paints=tuple(map(paint_of, parts)),
+        )
 
     def recoloured(self, paint: Paint) -> "TexturedMesh":
         """The mesh with one paint everywhere."""
@@ -149,33 +140,20 @@ class TexturedMesh:
         """(3,) middle of the box around the mesh."""
         return 0.5 * (self.hull.min(axis=0) + self.hull.max(axis=0))
 
-    def save_ply(self, path: Path, *, scale: float = 1000.0) -> None:
+    def save_ply(self, path: Path) -> None:
         """Write a PLY file in mm, with all textures in one picture beside it, as BOP's textured
         models have."""
         uv, picture = self._atlas()
-        cv2.imwrite(
-            str(path.with_suffix(".png")),
-            (255 * picture[..., ::-1] ** (1 / 2.2) + 0.5).astype(np.uint8),
-        )
+        coded = (255 * picture[..., ::-1] ** (1 / 2.2) + 0.5).astype(np.uint8)
+        cv2.imwrite(str(path.with_suffix(".png")), coded)
         count = 3 * len(self.triangles)
-        columns = ("x", "y", "z", "nx", "ny", "nz", "texture_u", "texture_v")
-        header = ["ply", "format binary_little_endian 1.0", f"comment TextureFile {path.stem}.png"]
-        header += [f"element vertex {count}", *(f"property float {name}" for name in columns)]
-        header += [
-            f"element face {count // 3}",
-            "property list uchar int vertex_indices",
-            "end_header",
-            "",
-        ]
         normals = self.normals / (np.linalg.norm(self.normals, axis=2, keepdims=True) + 1e-12)
-        vertices = (
-            np.concatenate([scale * self.triangles, normals, uv], axis=2)
-            .reshape(count, 8)
-            .astype("<f4")
-        )
+        vertices = np.concatenate([1000.0 * self.triangles, normals, uv], axis=2).astype("<f4")
         faces = np.zeros(count // 3, [("n", "u1"), ("v", "<i4", 3)])
-        faces["n"], faces["v"] = 3, np.arange(count).reshape(-1, 3)
-        path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
+        faces["n"] = 3
+        faces["v"] = np.arange(count).reshape(-1, 3)
+        header = PLY_HEADER.format(stem=path.stem, vertices=count, faces=count // 3)
+        path.write_bytes(header.encode() + vertices.tobytes() + faces.tobytes())
 
     def _atlas(self) -> tuple[Array, Array]:
         """Texture coordinates (F, 3, 2) in one (h, w, 3) picture of all textures, repeated where
@@ -262,6 +240,35 @@ def face_normals(corners: Array) -> Array:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
+def columns_of(part: trimesh.Trimesh) -> tuple[Array, Array, Array]:
+    """Corners (F, 3, 3), their normals, and texture coordinates (F, 3, 2) of a mesh that trimesh
+    has read."""
+    faces = np.asarray(part.faces)
+    corners = np.asarray(part.vertices)[faces]
+    normals = part._cache.cache.get("vertex_normals")  # those of the file
+    if normals is None:
+        normals = np.repeat(face_normals(corners)[:, None], 3, axis=1)
+    else:
+        normals = np.asarray(normals)[faces]
+    uv = getattr(part.visual, "uv", None)
+    uv = np.zeros((*faces.shape, 2)) if uv is None else np.asarray(uv)[faces]
+    return corners, normals, uv
+
+
+def paint_of(part: trimesh.Trimesh) -> Texture:
+    """The material of a mesh that trimesh has read."""
+    material = getattr(part.visual, "material", None)
+    has_uv = getattr(part.visual, "uv", None) is not None
+    image = getattr(material, "image", None) if has_uv else None
+    if image is None:
+        diffuse = np.asarray(getattr(material, "diffuse", [160] * 3), float)[:3] / 255
+        picture = (np.clip(diffuse, 0.01, 1) ** 2.2)[None, None]
+    else:
+        picture = linear_texture(image)
+    specular = np.asarray(getattr(material, "specular", [0] * 3), float)[:3]
+    return Texture(picture.astype(np.float32), float(specular.mean() / 255))
+
+
 def linear_texture(image: Any) -> Array:
     """(h, w, 3) float32 linear colours of a Pillow picture; transparent parts are light grey."""
     rgba = np.asarray(image.convert("RGBA"), np.float32) / 255
@@ -316,75 +323,91 @@ def render(
     h = round(SUPERSAMPLING * H)
     w = round(SUPERSAMPLING * W)
     zoom = np.array([[w / W, 0, 0.5 * (w / W - 1)], [0, h / H, 0.5 * (h / H - 1)], [0, 0, 1.0]])
-    v, u = np.mgrid[0:h, 0:w].reshape(2, -1)
-    rays = (np.stack([u, v, np.ones(len(u))], -1) @ np.linalg.inv(zoom @ K).T).astype(np.float32)
+    zoomed = zoom @ K
+    pixels = np.mgrid[0:h, 0:w].reshape(2, -1)[::-1].T
+    homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
+    rays = (homogeneous @ np.linalg.inv(zoomed).T).astype(np.float32)
     start = np.zeros_like(rays)
     corners = [s.points(s.mesh.triangles) @ R.T + t for s in shapes]
-    first = np.cumsum([0, *map(len, corners)])
-    triangles = np.concatenate(corners)
-    scene = _rays(triangles)
+    scene = _rays(np.concatenate(corners))
     triangle, _, _, depth = scene.hits(start, rays)
     hit = np.flatnonzero(np.isfinite(depth))
     points = rays[hit] * depth[hit, None]
-    numbers = triangle[hit]
+    seen_by_ray = seen_surface(shapes, R, corners, triangle[hit], points)
+    side = max(h, w)
+    picture = cv2.resize(background, (side, side))[:h, :w].reshape(-1, 3).astype(np.float32)
+    picture[hit] = shade_points(scene, points, *seen_by_ray[1:], light)
+
+    def shrink(x: Array) -> Array:
+        rows = x.reshape(h, w, -1).astype(np.float32)
+        return cv2.resize(rows, (W, H), interpolation=cv2.INTER_AREA)
+
+    annotated = [k for k, shape in enumerate(shapes) if shape.obj_id is not None]
+    seen = np.zeros((len(annotated), H, W), bool)
+    whole = np.zeros((len(annotated), H, W), bool)
+    first = np.zeros(h * w, np.float32)
+    for i, k in enumerate(annotated):
+        mask = np.zeros(h * w, np.float32)
+        mask[hit[seen_by_ray[0] == k]] = 1.0
+        seen[i] = shrink(mask) > 0.5
+        near = _in_box(pixels, shapes[k].hull @ R.T + t, zoomed)
+        alone = np.zeros(h * w, np.float32)
+        if near.any():
+            distance = _rays(corners[k]).distance(start[near], rays[near])
+            alone[near] = np.nan_to_num(distance, posinf=0.0)
+        whole[i] = shrink(alone > 0) > 0.5
+        if i == 0:
+            first = alone
+    flat_depth = cv2.resize(first.reshape(h, w), (W, H), interpolation=cv2.INTER_NEAREST)
+    return Picture(shrink(picture), seen, whole, flat_depth)
+
+
+def seen_surface(
+    shapes: list[Placed], R: Array, corners: list[Array], numbers: Array, points: Array
+) -> tuple[Array, ...]:
+    """What rays see at points (N, 3) of triangles with numbers (N,): the number of the shape,
+    normal (N, 3) towards the camera, colour (N, 3), gloss and shininess.
+
+    Args:
+        R: scene -> camera.
+        corners: of each shape the triangles (F, 3, 3), numbered one shape after the other.
+    """
+    first = np.cumsum([0, *map(len, corners)])
     owner = np.searchsorted(first, numbers, side="right") - 1
-    colour = np.zeros_like(points)
     normal = np.zeros_like(points)
-    gloss = np.zeros(len(hit))
-    shine = np.ones(len(hit))
-    weights = barycentric(triangles[numbers], points)
+    colour = np.zeros_like(points)
+    gloss = np.zeros(len(points))
+    shininess = np.ones(len(points))
+    weights = barycentric(np.concatenate(corners)[numbers], points)[..., None]
     for k in np.unique(owner):
         here = np.flatnonzero(owner == k)
         mesh = shapes[k].mesh
         own = numbers[here] - first[k]
-        w3 = weights[here, :, None]
-        n = (w3 * mesh.normals[own]).sum(axis=1)
-        n = np.where(
-            np.linalg.norm(n, axis=1, keepdims=True) > 1e-9, n, face_normals(mesh.triangles[own])
-        )
+        n = (weights[here] * mesh.normals[own]).sum(axis=1)
+        has_normal = np.linalg.norm(n, axis=1, keepdims=True) > 1e-9
+        n = np.where(has_normal, n, face_normals(mesh.triangles[own]))
         normal[here] = n @ (R @ shapes[k].rotation).T
-        local = (w3 * mesh.triangles[own]).sum(axis=1)
-        uv = (w3 * mesh.uv[own]).sum(axis=1)
+        local = (weights[here] * mesh.triangles[own]).sum(axis=1)
+        uv = (weights[here] * mesh.uv[own]).sum(axis=1)
         for number in np.unique(mesh.paint[own]):
             part = mesh.paint[own] == number
             paint = mesh.paints[number]
             colour[here[part]] = paint.colours(local[part], uv[part])
-            gloss[here[part]], shine[here[part]] = paint.gloss, paint.shininess
+            gloss[here[part]] = paint.gloss
+            shininess[here[part]] = paint.shininess
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
     normal *= np.sign(-(normal * points).sum(axis=1, keepdims=True) + 1e-12)
-    side = max(h, w)
-    picture = cv2.resize(background, (side, side))[:h, :w].reshape(-1, 3).astype(np.float32)
-    picture[hit] = shade_points(scene, points, normal, colour, np.clip(gloss, 0, 1), shine, light)
+    return owner, normal, colour, np.clip(gloss, 0, 1), shininess
 
-    def shrink(x: Array) -> Array:
-        return cv2.resize(
-            x.reshape(h, w, -1).astype(np.float32), (W, H), interpolation=cv2.INTER_AREA
-        )
 
-    annotated = [k for k, shape in enumerate(shapes) if shape.obj_id is not None]
-    seen, whole = np.zeros((2, len(annotated), H, W), bool)
-    alone = np.zeros(h * w, np.float32)
-    for i, k in enumerate(annotated):
-        mask = np.zeros(h * w, np.float32)
-        mask[hit[owner == k]] = 1.0
-        seen[i] = shrink(mask) > 0.5
-        hull = shapes[k].hull @ R.T + t
-        near = np.full(h * w, True)
-        if hull[:, 2].min() > 1e-6:
-            flat = hull @ (zoom @ K).T
-            flat = flat[:, :2] / flat[:, 2:]
-            low = flat.min(axis=0) - 1
-            high = flat.max(axis=0) + 1
-            near = (u >= low[0]) & (u <= high[0]) & (v >= low[1]) & (v <= high[1])
-        distance = np.zeros(h * w, np.float32)
-        if near.any():
-            distance[near] = np.nan_to_num(
-                _rays(corners[k]).distance(start[near], rays[near]), posinf=0.0
-            )
-        whole[i] = shrink(distance > 0) > 0.5
-        alone = distance if i == 0 else alone
-    flat_depth = cv2.resize(alone.reshape(h, w), (W, H), interpolation=cv2.INTER_NEAREST)
-    return Picture(shrink(picture), seen, whole, flat_depth)
+def _in_box(pixels: Array, hull: Array, K: Array) -> Array:
+    """(N,) whether pixels (N, 2) may show an object with a hull (P, 3) in the camera's frame."""
+    if hull[:, 2].min() <= 1e-6:
+        return np.full(len(pixels), True)
+    flat = hull @ K.T
+    flat = flat[:, :2] / flat[:, 2:]
+    inside = (pixels >= flat.min(axis=0) - 1) & (pixels <= flat.max(axis=0) + 1)
+    return inside.all(axis=1)
 
 
 def _rays(triangles: Array) -> RayScene:

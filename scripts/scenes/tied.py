@@ -30,32 +30,36 @@ def holed(rng: Rng) -> Surface:
     row = int(rng.integers(0, levels - 1))
     columns = int(rng.integers(3, 8))
     first = int(rng.integers(AROUND))
-    ring = np.arange((levels - 1) * AROUND)
-    hidden = (ring // AROUND == row) & ((ring % AROUND - first) % AROUND < columns)
-    kept = np.concatenate([np.tile(~hidden, 2), np.ones(len(body.faces) - 2 * len(ring), bool)])
+    cells = np.arange((levels - 1) * AROUND)
+    of_row = cells // AROUND == row
+    hidden = of_row & ((cells % AROUND - first) % AROUND < columns)
+    kept = np.ones(len(body.faces), bool)
+    kept[: 2 * len(cells)] = np.tile(~hidden, 2)  # two triangles a cell, then the caps
     return Surface(body.vertices, body.faces[kept])
 
 
 def hollow(rng: Rng) -> Surface:
     """A box with a cavity in one half, open below."""
-    w, d, h = rng.uniform((0.8, 0.4, 0.3), (1.4, 0.8, 0.7))
+    w = rng.uniform(0.8, 1.4)
+    d = rng.uniform(0.4, 0.8)
+    h = rng.uniform(0.3, 0.7)
     wall = rng.uniform(0.03, 0.08)
     deep = h - wall
-    cavity = (0.5 * w - 1.5 * wall, d - 2.0 * wall, deep)
-    at = 0.25 * w
     x = -0.5 * w
     y = 0.5 * d
-    half = Surface(
-        np.array([(x, -y, 0), (0.0, -y, 0), (0.0, y, 0), (x, y, 0)]),
-        np.array([[0, 2, 1], [0, 3, 2]]),
-    )
+    corners = np.array([(x, -y, 0), (0.0, -y, 0), (0.0, y, 0), (x, y, 0)])
+    half = Surface(corners, np.array([[0, 2, 1], [0, 3, 2]]))
     whole = _without_bottom((w, d, h), (0.0, 0.0, 0.5 * h))
-    return join([whole, _without_bottom(cavity, (at, 0.0, 0.5 * deep)), half])
+    size = (0.5 * w - 1.5 * wall, d - 2.0 * wall, deep)
+    cavity = _without_bottom(size, (0.25 * w, 0.0, 0.5 * deep))
+    return join([whole, cavity, half])
 
 
 def footed(rng: Rng) -> Surface:
     """A box or a disc with a block under one end."""
-    w, d, h = rng.uniform((0.7, 0.5, 0.15), (1.2, 0.7, 0.6))
+    w = rng.uniform(0.7, 1.2)
+    d = rng.uniform(0.5, 0.7)
+    h = rng.uniform(0.15, 0.6)
     round_body = rng.random() < 0.4
     body = _body(w, d, h, 0.5 * w if round_body else None)
     block = box(rng.uniform((0.1, 0.1, 0.03), (0.2, 0.25, 0.08)))
@@ -64,34 +68,45 @@ def footed(rng: Rng) -> Surface:
 
 def marked(rng: Rng) -> Surface:
     """A box or a cylinder with a small cube on one end of its top."""
-    w, d, h = rng.uniform((0.8, 0.4, 0.3), (1.2, 0.7, 0.7))
+    w = rng.uniform(0.8, 1.2)
+    d = rng.uniform(0.4, 0.7)
+    h = rng.uniform(0.3, 0.7)
     round_body = rng.random() < 0.3
     body = _body(w, d, h, 0.4 * w if round_body else None)
     side = rng.uniform(0.05, 0.14)
-    at = 0.4 * w - 0.5 * side if not round_body else 0.3 * w
-    return join([body, box(side).moved((at, 0, h + 0.5 * side))])
+    at = 0.3 * w if round_body else 0.4 * w - 0.5 * side
+    cube = box(side).moved((at, 0, h + 0.5 * side))
+    return join([body, cube])
 
 
 def plated(rng: Rng) -> Surface:
     """A plate or a disc with a flat block, 0.03 to 0.05 radii high, on one end of its top."""
-    w, d, h = rng.uniform((0.9, 0.6, 0.08), (1.2, 0.9, 0.3))
+    w = rng.uniform(0.9, 1.2)
+    d = rng.uniform(0.6, 0.9)
+    h = rng.uniform(0.08, 0.3)
     round_body = rng.random() < 0.3
     body = _body(w, d, h, 0.5 * w if round_body else None)
     radius = 0.5 * float(np.linalg.norm((w, w if round_body else d, h)))
-    long, wide = rng.uniform(0.12, 0.3, 2)
+    long = rng.uniform(0.12, 0.3)
+    wide = rng.uniform(0.12, 0.3)
     high = rng.uniform(0.03, 0.05) * radius
-    block = box((long, wide, high)).moved((0.45 * w - 0.5 * long, 0, h + 0.5 * high))
+    at = (0.45 * w - 0.5 * long, 0, h + 0.5 * high)
+    block = box((long, wide, high)).moved(at)
     return join([body, block])
 
 
 def handed(rng: Rng) -> Surface:
     """A bracket that its mirror image does not match, such as a left part."""
-    long, wide, thick = rng.uniform((0.8, 0.3, 0.08), (1.2, 0.5, 0.2))
+    long = rng.uniform(0.8, 1.2)
+    wide = rng.uniform(0.3, 0.5)
+    thick = rng.uniform(0.08, 0.2)
     plate = box((long, wide, thick))
-    arm = box((thick, wide, rng.uniform(0.3, 0.7)))
-    arm = arm.moved((0.5 * (long - thick), 0, 0.5 * float(np.ptp(arm.vertices[:, 2]))))
-    reach = rng.uniform(0.3, 0.6)
-    pin = bar((-0.3 * long, 0, 0), (-0.3 * long, 0.5 * wide + reach, 0), rng.uniform(0.04, 0.09))
+    high = rng.uniform(0.3, 0.7)
+    arm = box((thick, wide, high))
+    arm = arm.moved((0.5 * (long - thick), 0, 0.5 * high))
+    x = -0.3 * long
+    y = 0.5 * wide + rng.uniform(0.3, 0.6)
+    pin = bar((x, 0, 0), (x, y, 0), rng.uniform(0.04, 0.09))
     return join([plate, arm, pin])
 
 
