@@ -46,14 +46,14 @@ class FieldDataset(Dataset[dict[str, Tensor]]):
         field = self._filter(sample["depth"][None])
         code = F.avg_pool2d(doubled_angle(field), 2)
         length = code.norm(dim=1)
+        code = code * length.sum() / (length.square().sum() + 1e-6)
         describe = ViewDescriber(self.scenes.mesh(index), SETTINGS)
         rotations = sample["rotation"] @ _view_rotations(torch.Generator().manual_seed(index))
-        views = self._filter(
-            describe.depth(rotations, sample["distance"].expand(len(rotations)))[0]
-        )
+        depth, *_ = describe.depth(rotations, sample["distance"].expand(len(rotations)))
+        views = self._filter(depth)
         return {
             "image": (255 * sample["image"]).round().to(torch.uint8),
-            "code": (code * length.sum() / (length.square().sum() + 1e-6))[0].half(),
+            "code": code[0].half(),
             "mask": F.avg_pool2d((sample["depth"] > 0).half(), 2),
             "descriptors": self._descriptor(torch.cat([field, views])).half(),
         }
@@ -120,21 +120,27 @@ def augment(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, T
         return torch.rand(len(batch["image"]), *shape, generator=generator)
 
     mirror = draw(1, 1, 1) < 0.5
-    images = torch.where(mirror, batch["image"].flip(3), batch["image"])
-    code = torch.where(
-        mirror, batch["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None], batch["code"]
-    )
-    mask = torch.where(mirror, batch["mask"].flip(3), batch["mask"])
-    descriptors = torch.where(
-        mirror[:, 0], mirrored_descriptors(batch["descriptors"]), batch["descriptors"]
-    )
+    sign = torch.tensor([1.0, -1.0])[:, None, None]  # of the two parts of a code
+    mirrored = {
+        "image": batch["image"].flip(3),
+        "code": batch["code"].flip(3) * sign,
+        "mask": batch["mask"].flip(3),
+    }
+    found = {name: torch.where(mirror, other, batch[name]) for name, other in mirrored.items()}
+    descriptors = batch["descriptors"]
+    other = mirrored_descriptors(descriptors)
+    found["descriptors"] = torch.where(mirror[:, 0], other, descriptors)
+    images = found["image"]
     grey = images.mean(dim=1, keepdim=True)
     images = grey + (images - grey) * (1.4 * draw(1, 1, 1))
     images = torch.where(draw(1, 1, 1) < 0.3, images.flip(1), images)
     images = torch.where(draw(1, 1, 1) < 0.1, 1.0 - images, images)
-    images = (images - 0.5) * (0.6 + 0.7 * draw(1, 1, 1)) + 0.5 + 0.2 * (draw(3, 1, 1) - 0.5)
-    images = images + 0.02 * draw(1, 1, 1) * torch.randn(images.shape, generator=generator)
-    return {"image": images.clamp(0, 1), "code": code, "mask": mask, "descriptors": descriptors}
+    contrast = 0.6 + 0.7 * draw(1, 1, 1)
+    tint = 0.2 * (draw(3, 1, 1) - 0.5)
+    images = (images - 0.5) * contrast + 0.5 + tint
+    noise = 0.02 * draw(1, 1, 1)
+    images = images + noise * torch.randn(images.shape, generator=generator)
+    return found | {"image": images.clamp(0, 1)}
 
 
 def losses(output: Tensor, batch: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -151,16 +157,16 @@ def losses(output: Tensor, batch: dict[str, Tensor]) -> dict[str, Tensor]:
     """
     code = output[:, :2]
     target = batch["code"]
-    predicted = hog_layer(SETTINGS)(halved_angle(code))
+    predicted = F.normalize(hog_layer(SETTINGS)(halved_angle(code)))
     true = batch["descriptors"][:, 0]
-    correlation = (
-        F.normalize(predicted) @ F.normalize(torch.cat([true, mirrored_descriptors(true)])).T
-    )
+    candidates = F.normalize(torch.cat([true, mirrored_descriptors(true)]))
+    correlation = predicted @ candidates.T
     labels = torch.arange(len(predicted), device=predicted.device)
     views = F.normalize(batch["descriptors"][:, 1:], dim=2)
-    among_views = (views @ F.normalize(predicted, dim=1)[..., None])[..., 0]
+    among_views = (views @ predicted[..., None])[..., 0]
+    error = (code - target).square().sum(dim=1).mean()
     return {
-        "field": (code - target).square().sum(dim=1).mean() / target.square().sum(dim=1).mean(),
+        "field": error / target.square().sum(dim=1).mean(),
         "mask": F.binary_cross_entropy_with_logits(output[:, 2:], batch["mask"]),
         "descriptor": (1.0 - correlation.diagonal()).mean(),
         "ranking": 0.1 * F.cross_entropy(correlation / TEMPERATURE, labels),

@@ -63,23 +63,23 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
         occluded = bool(rng.random() < 0.3)
         options = {"size": PHOTOGRAPH, "upright": upright, "occluded": occluded}
         scene = single(shape, 1, _clutter, random_texture, rng, **options)
-        (R, t, _), target = scene.views[0], scene.shapes[0]
+        R, t, _ = scene.views[0]
+        target = scene.shapes[0]
         centre = R @ target.points(shape.centre) + t
         straight = rotation_towards(torch.from_numpy(centre)).numpy().T
         R = straight @ R
         t = straight @ t
-        K, (x0, y0, x1, y1) = _crop_camera(target, R, t, rng, self._size)
-        picture = scene.render((R, t, K), (self._size, self._size))
+        size = self._size
+        K, (x0, y0, x1, y1) = _crop_camera(target, R, t, rng, size)
+        picture = scene.render((R, t, K), (size, size))
         # hidden objects are of no use for training
         if picture.seen.sum() < 0.1 * picture.whole.sum():
-            picture = replace(scene, shapes=[target]).render((R, t, K), (self._size, self._size))
-        image = np.pad(
-            picture.linear[y0:y1, x0:x1],
-            ((y0, self._size - y1), (x0, self._size - x1), (0, 0)),
-            mode="edge",
-        )
+            picture = replace(scene, shapes=[target]).render((R, t, K), (size, size))
+        inside = picture.linear[y0:y1, x0:x1]
+        border = ((y0, size - y1), (x0, size - x1), (0, 0))
+        image = simulate_camera(np.pad(inside, border, mode="edge"), rng)
         return {
-            "image": torch.from_numpy(simulate_camera(image, rng)).permute(2, 0, 1).float() / 255.0,
+            "image": torch.from_numpy(image).permute(2, 0, 1).float() / 255.0,
             "depth": torch.from_numpy(picture.depth)[None],
             "rotation": torch.from_numpy(R @ target.rotation).float(),
             "distance": torch.tensor(np.linalg.norm(centre), dtype=torch.float32),
@@ -112,16 +112,18 @@ def _crop_camera(
     flat = placed[:, :2] / np.maximum(placed[:, 2:], 0.1)
     side = np.ptp(flat, axis=0)
     box = np.concatenate([flat.min(axis=0), flat.max(axis=0)])
-    box += rng.normal(0, rng.choice([0.01, 0.05]), 4) * np.tile(side, 2)
-    border = np.array([-np.inf, -np.inf, np.inf, np.inf])
-    if rng.random() < 0.2:  # the photograph's border cuts the object
-        k = int(rng.integers(4))
-        box[k] += (0.5 - k // 2) * 2 * rng.uniform(0.1, 0.45) * side[k % 2]
-        border[k] = box[k]
+    deviation = rng.choice([0.01, 0.05])
+    box += rng.normal(0, deviation, 4) * np.tile(side, 2)
+    cut = None  # the side of the box at which the photograph's border cuts the object
+    if rng.random() < 0.2:
+        cut = int(rng.integers(4))
+        inwards = 1 - 2 * (cut // 2)
+        box[cut] += inwards * rng.uniform(0.1, 0.45) * side[cut % 2]
     A = crop_transforms(square_boxes(torch.from_numpy(box), MARGIN), size).numpy()
-    corners = np.where(np.isfinite(border), border, 0).reshape(2, 2) @ A[:2, :2] + A[:2, 2]
-    area = np.where(
-        np.isfinite(border), np.round(corners.reshape(-1) + 0.5), np.array([0, 0, size, size])
-    )
-    x0, y0, x1, y1 = np.clip(area, 0, size).astype(int).tolist()
+    area = [0, 0, size, size]
+    if cut is not None:
+        axis = cut % 2
+        place = A[axis, axis] * box[cut] + A[axis, 2]
+        area[cut] = int(np.clip(np.round(place + 0.5), 0, size))
+    x0, y0, x1, y1 = area
     return A, (x0, y0, x1, y1)

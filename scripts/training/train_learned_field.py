@@ -10,12 +10,14 @@ those of field_dataset.py; one of them is backpropagated through HOG.
 import json
 import math
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
@@ -31,38 +33,41 @@ from scripts.training.generated import GeneratedScenes
 VALIDATION_SEED = 1_000_003
 
 
+BATCH = 32  # scenes in a step
+FRESH = 8  # of them new ones
+REPLAY = 15_000  # scenes that are stored for reuse, 100 kB each
+RATE = 3e-3  # highest learning rate
+HELD_OUT = 60  # scenes
+EVERY = 10.0  # minutes between validations
+
+
 class Validation:
     """Held-out scenes of upright objects, each ranked against the views of its mesh."""
 
-    def __init__(self, count: int) -> None:
-        scenes = GeneratedScenes(count, seed=VALIDATION_SEED, upright=1.0)
+    def __init__(self) -> None:
+        scenes = GeneratedScenes(HELD_OUT, seed=VALIDATION_SEED, upright=1.0)
         views = sample_views()
-        self.images = []
-        self.depths = []
-        self.errors = []
-        self.banks = []
-        for i in tqdm(range(count), desc="validation banks", mininterval=10):
+        distances = torch.full((len(views),), 5.0)
+        self.samples = []
+        for i in tqdm(range(HELD_OUT), desc="validation banks", mininterval=10):
             sample = scenes[i]
             describe = ViewDescriber(scenes.mesh(i), SETTINGS)
-            described = describe(views.rotations, torch.full((len(views),), 5.0))
-            self.images.append(sample["image"])
-            self.depths.append(sample["depth"])
-            self.errors.append(
-                rotation_error(views.rotations.float(), sample["rotation"].expand(len(views), 3, 3))
-            )
-            self.banks.append(described["descriptors"].half())
+            bank = describe(views.rotations, distances)["descriptors"].half()
+            errors = rotation_error(views.rotations.float(), sample["rotation"])
+            self.samples.append((sample["image"], sample["depth"], errors, bank))
 
     @torch.no_grad()
-    def __call__(self, field: torch.nn.Module) -> dict[str, float]:
+    def __call__(self, network: FieldNetwork) -> dict[str, float]:
         descriptor = hog_layer(SETTINGS)
+        saliency = depth_filter(SETTINGS)
         errors = []
         cosines = []
-        for image, depth, error, bank in zip(
-            self.images, self.depths, self.errors, self.banks, strict=True
-        ):
-            query = descriptor(field(image[None]))
+        for image, depth, error, bank in self.samples:
+            code = network(image[None])[:, :2]
+            field = F.interpolate(halved_angle(code), scale_factor=2.0, mode="bilinear")
+            query = descriptor(field)
             errors.append(float(error[F.cosine_similarity(query, bank.float()).argmax()]))
-            target = descriptor(depth_filter(SETTINGS)(depth[None]))
+            target = descriptor(saliency(depth[None]))
             cosines.append(float(F.cosine_similarity(query, target)))
         e = np.array(errors)
         return {
@@ -73,71 +78,55 @@ class Validation:
         }
 
 
-class _Field(torch.nn.Module):
-    def __init__(self, network: FieldNetwork) -> None:
-        super().__init__()
-        self.network = network
+def learning_rate(step: int, done: float) -> float:
+    """It rises for 200 steps, and falls as a cosine; ``done`` is the fraction of the time."""
+    rise = min(1.0, (step + 1) / 200)
+    return RATE * rise * 0.5 * (1 + math.cos(math.pi * done))
 
-    def forward(self, image: Tensor) -> Tensor:
-        return F.interpolate(
-            halved_angle(self.network(image)[:, :2]), scale_factor=2.0, mode="bilinear"
-        )
+
+def averaged(mean: Tensor, now: Tensor, step: Tensor) -> Tensor:
+    """Of weights: the running mean after one more step; ``step`` counts from 0."""
+    keep = min(0.998, float((step + 1) / (step + 11)))
+    return mean + (1 - keep) * (now - mean)
 
 
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of weights and log")
     parser.add_argument("--minutes", type=float, default=90.0, help="training time")
-    parser.add_argument("--batch", type=int, default=32, help="scenes in a step")
-    parser.add_argument("--fresh", type=int, default=8, help="fresh scenes among them")
-    parser.add_argument(
-        "--replay", type=int, default=15_000, help="scenes stored for reuse, 100 kB each"
-    )
     parser.add_argument("--workers", type=int, default=1, help="processes that generate scenes")
-    parser.add_argument("--rate", type=float, default=3e-3, help="highest learning rate")
-    parser.add_argument("--validate", type=int, default=60, help="held-out scenes")
-    parser.add_argument("--every", type=float, default=10.0, help="minutes between validations")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
+    weights = options.out / "field.safetensors"
+    log = options.out / "log.jsonl"
+    log.unlink(missing_ok=True)
 
     torch.manual_seed(options.seed)
     network = FieldNetwork()
-    average = FieldNetwork()
-    average.load_state_dict(network.state_dict())
-    average.eval().requires_grad_(False)
+    average = AveragedModel(network, device="cpu", avg_fn=averaged, use_buffers=True)
     network.to(options.device, memory_format=torch.channels_last)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=0.02)
-    log = options.out / "log.jsonl"
-    log.unlink(missing_ok=True)
-    validation = Validation(options.validate)
-    generated = GeneratedScenes(10**9, seed=options.seed)
-    workers = {
-        "num_workers": options.workers,
-        "multiprocessing_context": "spawn" if options.workers else None,
-    }
-    loader = iter(DataLoader(FieldDataset(generated), options.fresh, **workers))
-    replay = ReplayBuffer(options.replay)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=0.02)
+    validation = Validation()
+    loader = DataLoader(
+        FieldDataset(GeneratedScenes(10**9, seed=options.seed)),
+        FRESH,
+        num_workers=options.workers,
+        multiprocessing_context="spawn" if options.workers else None,
+    )
+    replay = ReplayBuffer(REPLAY)
     generator = torch.Generator().manual_seed(options.seed)
-    totals = {}
+    means = Counter()
     start = time.monotonic()
-    spent = 0.0
+    minutes = 0.0
     validated = 0.0
-    step = 0
-    step_at_mark = 0
-    while spent < options.minutes:
-        replay.add(next(loader))
-        batch = augment(replay.draw(options.fresh, options.batch, generator), generator)
+    for step, fresh in enumerate(loader):
+        replay.add(fresh)
+        batch = augment(replay.draw(FRESH, BATCH, generator), generator)
         batch = {name: values.to(options.device) for name, values in batch.items()}
-        rate = (
-            options.rate
-            * min(1.0, (step + 1) / 200)
-            * 0.5
-            * (1 + math.cos(math.pi * spent / options.minutes))
-        )
         for group in optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = learning_rate(step, minutes / options.minutes)
         network.train()
         with torch.autocast(torch.device(options.device).type, torch.bfloat16):
             output = network(batch["image"].contiguous(memory_format=torch.channels_last))
@@ -146,30 +135,26 @@ def main() -> None:
         torch.stack(list(parts.values())).sum().backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
         optimizer.step()
-        step += 1
-        keep = min(0.998, step / (step + 10))
-        for mean, now in zip(
-            average.state_dict().values(), network.state_dict().values(), strict=True
-        ):
-            if mean.is_floating_point():
-                mean.lerp_(now.float().to(mean.device), 1 - keep)
-        for name, value in parts.items():
-            totals[name] = totals.get(name, 0.0) + float(value.detach())
-        spent = (time.monotonic() - start) / 60
-        if spent - validated > options.every or spent >= options.minutes:
-            entry = {"step": step, "minutes": round(spent, 2), "scenes": step * options.fresh}
-            entry |= {
-                name: round(value / (step - step_at_mark), 4) for name, value in totals.items()
-            }
-            entry |= {name: round(value, 4) for name, value in validation(_Field(average)).items()}
-            save_weights(average, options.out / "field.safetensors")
-            with log.open("a") as lines:
-                lines.write(json.dumps(entry) + "\n")
-            print(json.dumps(entry), flush=True)
-            totals = {}
-            validated = spent
-            step_at_mark = step
-    print(f"weights: {options.out / 'field.safetensors'}")
+        average.update_parameters(network)
+        means.update({name: float(value.detach()) for name, value in parts.items()})
+        means["steps"] += 1
+        minutes = (time.monotonic() - start) / 60
+        if minutes - validated <= EVERY and minutes < options.minutes:
+            continue
+        steps = means.pop("steps")
+        entry = {"step": step + 1, "minutes": minutes, "scenes": (step + 1) * FRESH}
+        entry |= {name: value / steps for name, value in means.items()}
+        entry |= validation(average.module.eval())
+        entry = {name: round(value, 4) for name, value in entry.items()}
+        save_weights(average.module, weights)
+        with log.open("a") as lines:
+            lines.write(json.dumps(entry) + "\n")
+        print(json.dumps(entry), flush=True)
+        means.clear()
+        validated = minutes
+        if minutes >= options.minutes:
+            break
+    print(f"weights: {weights}")
 
 
 if __name__ == "__main__":
