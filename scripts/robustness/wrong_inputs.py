@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -36,34 +37,8 @@ from scripts._shared import RESULTS, parser_of, stamp, write_json
 SECONDS = 20.0
 MEGABYTES = 4000
 
-GOOD_FILES = {
-    "cam.yml": """%YAML:1.0
----
-image_width: 240
-image_height: 180
-camera_matrix: !!opencv-matrix
-   data: [260., 0., 119.5, 0., 260., 89.5, 0., 0., 1.]
-distortion_coefficients: [-0.25, 0.1, 0., 0., 0.]
-""",
-    "chain.yaml": """cam0:
-  camera_model: pinhole
-  distortion_model: radtan
-  distortion_coeffs: [-0.25, 0.1, 0, 0, 0.01]
-  intrinsics: [260, 260, 119.5, 89.5]
-cam1:
-  intrinsics: [260, 260, 119.5, 89.5]
-""",
-    "cameras.txt": "1 PINHOLE 240 180 260 260 120 90\n2 OPENCV 240 180 260 260 120 90 -0.25 0.1 0 "
-    "0\n",
-    "camera.json": '{"fx": 260, "fy": 260, "cx": 119.5, "cy": 89.5}',
-    "camera.xml": "<a><camera_matrix><data>260 0 119.5 0 260 89.5 0 0 1</data></camera_matrix></a>",
-    "images.txt": "1 1 0 0 0 0 0 0 1 0.png\n\n",
-    "photos.csv": "photo,x0,y0,x1,y1\n0.png,95,54,197,148\n",
-    "start.json": '{"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "translation": [0, 0, 3]}',
-    "scene/scene_camera.json": '{"0": {"cam_K": [260, 0, 119.5, 0, 260, 89.5, 0, 0, 1], '
-    '"cam_R_w2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_w2c": [0, 0, 0]}}',
-}
-
+GOOD = Path(__file__).with_name("good")
+"""A folder of good cameras, lists and poses."""
 
 COMMANDS = {
     "rig.csv": "register --views {} truck.ply",
@@ -79,7 +54,7 @@ def cases(folder: Path) -> list[tuple[str, str]]:
     """Write the inputs of wrong_inputs.txt into a folder; command lines, and what their messages
     must contain."""
     write_files(folder)
-    (folder / "good" / "scene").mkdir(parents=True)
+    shutil.copytree(GOOD, folder / "good")
     write_rig(folder / "good")
     found = []
     rows = Path(__file__).with_suffix(".txt").read_text(encoding="utf-8").splitlines()
@@ -104,8 +79,7 @@ def cases(folder: Path) -> list[tuple[str, str]]:
 
 
 def write_rig(folder: Path) -> None:
-    """Write good calibrations, and a rig of photographs of the example mesh, two of which are
-    equal."""
+    """Write a rig of photographs of the example mesh, two of which are equal."""
     from curvireg_torch.synthetic import demo_scene
 
     rows = ["photo,x0,y0,x1,y1,camera,qw,qx,qy,qz,tx,ty,tz"]
@@ -119,8 +93,7 @@ def write_rig(folder: Path) -> None:
         quaternion = Rotation.from_matrix(scene.truth[:3, :3].numpy()).as_quat(scalar_first=True)
         shift = [f"{v:.9f}e+00" for v in scene.truth[:3, 3].tolist()]
         rows.append(",".join([name, box, "camera.json", *map(str, quaternion), *shift]))
-    for name, text in {**GOOD_FILES, "rig.csv": "\n".join(rows)}.items():
-        (folder / name).write_text(text)
+    (folder / "rig.csv").write_text("\n".join(rows))
 
 
 def write_picture(path: Path, image: Tensor) -> None:
@@ -143,7 +116,7 @@ def write_files(folder: Path) -> None:
     cr.ViewBank.build(example_mesh(), views, image_size=32, progress=False).save(
         folder / "truck.safetensors"
     )
-    (folder / "camera.json").write_text(GOOD_FILES["camera.json"])
+    shutil.copy(GOOD / "camera.json", folder)
     (folder / "photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.png,30,25,210,160\n")
     for name in ("text.jpg", "text.obj", "truck.step"):
         (folder / name).write_text("not what the name says")
@@ -152,9 +125,8 @@ def write_files(folder: Path) -> None:
         (folder / name).mkdir()
     for name in ("photo.png", "truck.ply", "truck.safetensors"):
         data = (folder / name).read_bytes()
-        (folder / name.replace("photo", "cut").replace("truck", "cut")).write_bytes(
-            data[: len(data) // 2]
-        )
+        half = folder / f"cut{Path(name).suffix}"
+        half.write_bytes(data[: len(data) // 2])
     (folder / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     trimesh.PointCloud(np.random.default_rng(0).normal(size=(5, 3))).export(folder / "points.ply")
     (folder / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
@@ -175,19 +147,21 @@ def answer(line: str, folder: Path, expected: str | None) -> dict[str, Any]:
     """
     start = time.perf_counter()
     command = [sys.executable, "-m", "curvireg_torch", *shlex.split(line)]
-    limit = {"timeout": 10 * SECONDS, "preexec_fn": limited}
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", cwd=folder, **limit
+            command,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            cwd=folder,
+            timeout=10 * SECONDS,
+            preexec_fn=limited,
         )
     except subprocess.TimeoutExpired:
         return {"line": line, "code": "timeout", "failure": "not done in time"}
     text = done.stderr.strip()
-    found = {
-        "line": line,
-        "code": done.returncode,
-        "seconds": round(time.perf_counter() - start, 1),
-    }
+    seconds = round(time.perf_counter() - start, 1)
+    found = {"line": line, "code": done.returncode, "seconds": seconds}
     if re.search(r"Traceback|site-packages|File \"", text) or done.returncode not in (0, 1, 2):
         found["failure"] = f"code {done.returncode}: {text[-400:]}"
     elif expected is not None and (done.returncode == 0 or expected not in text):
@@ -214,13 +188,17 @@ def damage(data: bytes, rng: np.random.Generator) -> bytes:
     return bytes(out)
 
 
+OF_PHOTO = "register {} --out out truck.ply --box 30 25 210 160"
+OF_MESH = "register photo.png {} --out out --box 30 25 210 160"
 DAMAGED = {
-    "photo.png": "register {} --out out truck.ply --box 30 25 210 160",
-    "photo.jpg": "register {} --out out truck.ply --box 30 25 210 160",
-    **{
-        f"truck.{kind}": "register photo.png {} --out out --box 30 25 210 160"
-        for kind in ("ply", "obj", "stl", "off", "glb", "safetensors")
-    },
+    "photo.png": OF_PHOTO,
+    "photo.jpg": OF_PHOTO,
+    "truck.ply": OF_MESH,
+    "truck.obj": OF_MESH,
+    "truck.stl": OF_MESH,
+    "truck.off": OF_MESH,
+    "truck.glb": OF_MESH,
+    "truck.safetensors": OF_MESH,
     "camera.json": "register photo.png truck.ply --box 30 25 210 160 --camera {} --out out",
     "photos.csv": "register --list {} --out out truck.ply",
 }
@@ -238,13 +216,12 @@ def main() -> int:
         wrong = cases(folder)
         answers = list(pool.map(lambda case: answer(case[0], folder, case[1]), wrong))
         lines = []
-        for k in range(options.damaged):
-            rng = np.random.default_rng(k)
-            name = list(DAMAGED)[k % len(DAMAGED)]
+        for k, (name, line) in zip(range(options.damaged), cycle(DAMAGED.items()), strict=False):
             damaged = folder / f"damaged{k}{Path(name).suffix}"
-            damaged.write_bytes(damage((folder / name).read_bytes(), rng))
-            line = DAMAGED[name].format(damaged.name)
-            lines.append(line.replace("--out out", f"--out out{k}"))  # lists do not share a folder
+            content = damage((folder / name).read_bytes(), np.random.default_rng(k))
+            damaged.write_bytes(content)
+            # lists do not share a folder
+            lines.append(line.format(damaged.name).replace("--out out", f"--out out{k}"))
         answers += pool.map(lambda line: answer(line, folder, None), lines)
     failures = [found for found in answers if "failure" in found]
     record = stamp() | {"cases": len(wrong), "damaged": len(lines)}
