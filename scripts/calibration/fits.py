@@ -25,13 +25,15 @@ RESOLUTIONS = np.arange(0.5, 1.55, 0.1).round(2).tolist()
 
 def folds_of(rows: Sequence[Row]) -> np.ndarray:
     """(n,) fold of each row; groups are assigned so that folds have about equal sizes."""
-    groups, counts = np.unique([row["group"] for row in rows], return_counts=True)
-    size = [0] * FOLDS
-    fold = {}
+    groups, member, counts = np.unique(
+        [row["group"] for row in rows], return_inverse=True, return_counts=True
+    )
+    fold = np.zeros(len(groups), int)
+    size = np.zeros(FOLDS)
     for k in np.argsort(-counts, kind="stable"):
-        fold[groups[k]] = int(np.argmin(size))
-        size[fold[groups[k]]] += int(counts[k])
-    return np.array([fold[row["group"]] for row in rows])
+        fold[k] = size.argmin()
+        size[fold[k]] += counts[k]
+    return fold[member]
 
 
 def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, float]) -> Row:
@@ -40,7 +42,7 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
     The standardised weights have a unit Gaussian prior, and the sign in ``signs``, if there is one.
     """
     names = list(rows[0]["features"])
-    X = np.array([[row["features"][n] or 0.0 for n in names] for row in rows])
+    X = np.array([[row["features"][name] or 0.0 for name in names] for row in rows])
     y = np.array([row["right"] for row in rows])
     mean = X.mean(axis=0)
     spread = X.std(axis=0)
@@ -48,22 +50,22 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
     Z = (X - mean) / spread
 
     def loss(p: np.ndarray) -> tuple[float, np.ndarray]:
-        logit = Z @ p[:-1] + p[-1]
-        prior = 0.5 * float(p[:-1] @ p[:-1])
-        value = float(weight @ (np.logaddexp(0.0, logit) - y * logit)) + prior
+        w = p[:-1]
+        logit = Z @ w + p[-1]
+        losses = np.logaddexp(0.0, logit) - y * logit
+        value = float(weight @ losses) + 0.5 * float(w @ w)
         slope = weight * (expit(logit) - y)
-        return value, np.append(Z.T @ slope + p[:-1], slope.sum())
+        return value, np.append(Z.T @ slope + w, slope.sum())
 
     ranges = {1.0: (0.0, None), -1.0: (None, 0.0)}
-    bounds = [*(ranges.get(signs.get(name, 0.0), (None, None)) for name in names), (None, None)]
-    found = minimize(loss, np.zeros(len(names) + 1), jac=True, bounds=bounds, method="L-BFGS-B").x
+    free = (None, None)
+    bounds = [ranges.get(signs.get(name), free) for name in names]
+    start = np.zeros(len(names) + 1)
+    found = minimize(loss, start, jac=True, bounds=[*bounds, free], method="L-BFGS-B").x
     w = found[:-1] / spread
     bias = float(found[-1] - w @ mean)
-    return {
-        "weights": dict(zip(names, w.round(4).tolist(), strict=True)),
-        "bias": round(bias, 4),
-        "n": len(y),
-    }
+    weights = dict(zip(names, w.round(4).tolist(), strict=True))
+    return {"weights": weights, "bias": round(bias, 4), "n": len(y)}
 
 
 def fit_level(rows: Sequence[Row], weight: np.ndarray, constants: Row) -> Row:
@@ -75,8 +77,10 @@ def fit_level(rows: Sequence[Row], weight: np.ndarray, constants: Row) -> Row:
     first = np.array([row["first"] for row in rows])
 
     def loss(p: np.ndarray) -> float:
-        confidence = np.clip(expit(p[0] * logit + p[1]) * share, 1e-9, 1.0 - 1e-9)
-        return float(-weight @ np.log(np.where(first, confidence, 1.0 - confidence)))
+        scale, level = p
+        confidence = np.clip(expit(scale * logit + level) * share, 1e-9, 1.0 - 1e-9)
+        said = np.where(first, confidence, 1.0 - confidence)
+        return float(-weight @ np.log(said))
 
     scale, level = minimize(loss, np.array([1.0, 0.0]), method="Nelder-Mead").x
     weights = {name: round(float(scale) * value, 4) for name, value in constants["weights"].items()}
@@ -86,21 +90,23 @@ def fit_level(rows: Sequence[Row], weight: np.ndarray, constants: Row) -> Row:
 
 def row_logit(row: Row, constants: Row) -> float:
     """Logit of the probability that any hypothesis of a row is right."""
-    weights = constants["weights"].items()
-    return float(constants["bias"] + sum(w * (row["features"][name] or 0.0) for name, w in weights))
+    features = row["features"]
+    terms = [weight * (features[name] or 0.0) for name, weight in constants["weights"].items()]
+    return float(constants["bias"] + sum(terms))
 
 
 def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
     """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some
     pose is right and some are not; without ``ties`` the resolution is 0."""
     decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT]
-    most = max((len(rows[k]["scores"]) for k in decided), default=1)
-    behind = np.full((len(decided), most), np.inf)
-    right = np.zeros((len(decided), most), bool)
-    for place, k in enumerate(decided):
-        scores = np.array(rows[k]["scores"])
+    chosen = [rows[k] for k in decided]
+    most = max((len(row["scores"]) for row in chosen), default=1)
+    behind = np.full((len(chosen), most), np.inf)
+    right = np.zeros((len(chosen), most), bool)
+    for place, row in enumerate(chosen):
+        scores = np.array(row["scores"])
         behind[place, : len(scores)] = scores.max() - scores
-        right[place, : len(scores)] = np.array(rows[k]["errors"]) < RIGHT
+        right[place, : len(scores)] = np.array(row["errors"]) < RIGHT
 
     def loss(slope: float, resolution: float) -> float:
         logits = -slope * np.maximum(0.0, behind - resolution)
@@ -199,9 +205,9 @@ def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
     by_set["grey"] = np.array([row["grey"] for row in rows])
     by_set["with colours"] = ~by_set["grey"]
     errors = np.array([row["errors"][0] for row in rows])
-    quality["sets"] = {
-        name: quality_of(p[own], first[own], weight[own]) | errors_within(errors[own])
-        for name, own in by_set.items()
-        if own.any()
-    }
+    quality["sets"] = {}
+    for name, own in by_set.items():
+        if own.any():
+            of_set = quality_of(p[own], first[own], weight[own])
+            quality["sets"][name] = of_set | errors_within(errors[own])
     return fit(np.full(len(rows), True)), quality

@@ -23,9 +23,11 @@ class Material:
         self._second = random_colour(rng)
         kinds = ("waves", "stripes", "checks", "cells", "print", "grain")
         self._kind = "plain" if rng.random() < plain else str(rng.choice(kinds))
-        self._axes = rng.normal(size=(3, 6)) * np.exp(rng.uniform(0.3, 2.5))
+        axes = rng.normal(size=(3, 6))
+        self._axes = axes * np.exp(rng.uniform(0.3, 2.5))
         self._phases = rng.uniform(0, 2 * np.pi, 6)
-        self._seeds = rng.uniform(-1, 1, (int(rng.integers(4, 25)), 3))
+        cells = int(rng.integers(4, 25))
+        self._seeds = rng.uniform(-1, 1, (cells, 3))
         self._palette = np.stack([random_colour(rng) for _ in self._seeds])
         self._strength = rng.uniform(0.1, 1.0)
         self.gloss = 0.0 if rng.random() < 0.5 else rng.uniform(0.1, 0.9)
@@ -37,8 +39,8 @@ class Material:
             return np.broadcast_to(self._first, points.shape)
         along = points @ self._axes + self._phases
         if self._kind == "cells":
-            nearest = ((points[:, None] - self._seeds) ** 2).sum(axis=-1).argmin(axis=1)
-            towards = self._palette[nearest] - self._first
+            squared = ((points[:, None] - self._seeds) ** 2).sum(axis=-1)
+            towards = self._palette[squared.argmin(axis=1)] - self._first
             return np.clip(self._first + self._strength * towards, 0, 1)
         if self._kind == "waves":
             weight = 0.5 + 0.5 * np.sin(along).mean(axis=1)
@@ -50,8 +52,9 @@ class Material:
             row = np.floor(along[:, 0])
             place = np.floor(3 * along[:, 1])
             letters = np.sin(12.9898 * row + 78.233 * place) * 43758.5453
-            is_printed = (letters - np.floor(letters) > 0.5) & (np.sin(7.1 * row) > -0.3)
-            weight = is_printed & (along[:, 0] - row > 0.4)
+            is_letter = letters - np.floor(letters) > 0.5
+            is_line = np.sin(7.1 * row) > -0.3
+            weight = is_letter & is_line & (along[:, 0] - row > 0.4)
         else:
             coarse = np.sin(17.0 * along).mean(axis=1)
             weight = coarse * np.sin(31.0 * along[:, ::-1]).mean(axis=1) + 0.5
@@ -66,7 +69,8 @@ def random_picture(rng: Rng, size: int) -> Array:
     if rng.random() < 0.4:
         bottom = np.clip(top + rng.normal(0, 0.1, 3), 0, 1)
     ramp = np.linspace(0, 1, size)[:, None, None]
-    picture = np.broadcast_to(top + ramp * (bottom - top), (size, size, 3)).astype(np.float32)
+    rows = top + ramp * (bottom - top)
+    picture = np.broadcast_to(rows, (size, size, 3)).astype(np.float32)
     kind = rng.integers(5)
     if kind in (1, 2):  # clouds or foliage
         noise = np.zeros((size, size, 3), np.float32)
@@ -121,7 +125,8 @@ def random_texture(rng: Rng, size: int = 256) -> Array:
     if kind == 1:  # cloth: threads above and below each other, in stripes or checks
         threads = 2 * int(rng.integers(12, 32))
         stripes = int(rng.integers(1, 6))
-        weave = 0.5 + 0.5 * np.sin(2 * np.pi * threads * x) * np.sin(2 * np.pi * threads * y)
+        warp = np.sin(2 * np.pi * threads * x)
+        weave = 0.5 + 0.5 * warp * np.sin(2 * np.pi * threads * y)
         bands = np.sin(2 * np.pi * stripes * x)
         if rng.random() < 0.5:
             bands = bands * np.sin(2 * np.pi * stripes * y)
