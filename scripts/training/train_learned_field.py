@@ -85,8 +85,8 @@ def learning_rate(step: int, done: float) -> float:
 
 
 def averaged(mean: Tensor, now: Tensor, step: Tensor) -> Tensor:
-    """Of weights: the running mean after one more step; ``step`` counts from 0."""
-    keep = min(0.998, float((step + 1) / (step + 11)))
+    """Of weights: the running mean after one more step."""
+    keep = min(0.998, float(step / (step + 10)))
     return mean + (1 - keep) * (now - mean)
 
 
@@ -106,6 +106,7 @@ def main() -> None:
     torch.manual_seed(options.seed)
     network = FieldNetwork()
     average = AveragedModel(network, device="cpu", avg_fn=averaged, use_buffers=True)
+    average.n_averaged.fill_(1)  # the first weights count
     network.to(options.device, memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=0.02)
     validation = Validation()
