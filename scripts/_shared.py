@@ -38,10 +38,11 @@ def update_page(page: Path, name: str, body: str) -> None:
     )
 
 
-def table_lines(cells: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table whose first row is the header."""
-    lines = ["| " + " | ".join(row) + " |" for row in cells]
-    return [lines[0], "|---" * len(cells[0]) + "|", *lines[1:]]
+def markdown_table(rows: Sequence[Sequence[object]]) -> str:
+    """Rows of cells as Markdown, the first of them as the header."""
+    lines = ["| " + " | ".join(map(str, row)) + " |" for row in rows]
+    lines.insert(1, "|---" * len(rows[0]) + "|")
+    return "\n".join(lines) + "\n"
 
 
 def read_json(path: Path) -> Any:

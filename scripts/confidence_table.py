@@ -20,10 +20,10 @@ from sklearn.metrics import roc_auc_score
 from scripts._shared import (
     REPOSITORY,
     RESULTS,
+    markdown_table,
     parser_of,
     read_json,
     stamp,
-    table_lines,
     update_page,
     write_json,
 )
@@ -132,9 +132,9 @@ def table_of_generated(sets: Mapping[str, dict[str, Any]]) -> str:
     for name, photographs in GENERATED.items():
         one = sets[name]
         shares = [share(one[key]) for key in ("said", "right", "reliable")]
-        wrong = str(one["reliable and wrong"])
-        cells.append([photographs, str(one["n"]), *shares, wrong, share(one["auc"])])
-    return "\n".join([*table_lines(cells), ""])
+        wrong = one["reliable and wrong"]
+        cells.append([photographs, one["n"], *shares, wrong, share(one["auc"])])
+    return markdown_table(cells)
 
 
 def table_of_withheld(sets: Mapping[str, dict[str, Any]]) -> str:
@@ -142,12 +142,12 @@ def table_of_withheld(sets: Mapping[str, dict[str, Any]]) -> str:
     cells = [["set", "N", "within 5°: given, none", "within 15°", "median"]]
     for name in ("shapes", "packages"):
         both = (sets[name], sets[f"estimated_{name}"])
-        row = [name, str(sets[name]["n"])]
+        row = [name, sets[name]["n"]]
         for key in ("within 5", "within 15"):
             row.append(", ".join(share(one[key]) for one in both))
         row.append(", ".join(f"{one['median']:.1f}°" for one in both))
         cells.append(row)
-    return "\n".join([*table_lines(cells), ""])
+    return markdown_table(cells)
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -156,9 +156,9 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     cells = [header.split(" | ")]
     for row in rows:
         shares = [share(row[name]) for name in ("mean_confidence", "right")]
-        counts = [str(row[name]) for name in ("reliable", "reliable_right", "ambiguous")]
-        cells.append([f"`{row['name']}`", str(row["n"]), *shares, *counts, share(row["auc"])])
-    return "\n".join([*table_lines(cells), ""])
+        counts = [row[name] for name in ("reliable", "reliable_right", "ambiguous")]
+        cells.append([f"`{row['name']}`", row["n"], *shares, *counts, share(row["auc"])])
+    return markdown_table(cells)
 
 
 def share(value: float | None) -> str:

@@ -18,10 +18,10 @@ from typing import Any
 from scripts._shared import (
     REPOSITORY,
     RESULTS,
+    markdown_table,
     parser_of,
     read_json,
     stamp,
-    table_lines,
     update_page,
     write_json,
 )
@@ -114,8 +114,8 @@ def comparison(summaries: Sequence[Path], results: Path) -> str:
         earlier = stored(results / f"evaluation_{name}.json").get("summary", {})
         for key in COMPARED[measured["settings"]["dataset"]]:
             values = [score(summary.get(key), key) for summary in (earlier, measured)]
-            rows.append([name, str(measured["n"]), key, *values])
-    return "\n".join(table_lines(rows))
+            rows.append([name, measured["n"], key, *values])
+    return markdown_table(rows)
 
 
 def score(value: float | None, key: str) -> str:
@@ -142,7 +142,7 @@ def table_in_words(results: Path) -> str:
         summary = records[name]["summary"]
         right = summary.get("acc_30_deg", summary.get("acc_pi_6"))
         sure = of_set.get(name, {})
-        believed = [str(sure.get(key, "-")) for key in ("reliable", "reliable_right")]
+        believed = [sure.get(key, "-") for key in ("reliable", "reliable_right")]
         values = [percent(right), degrees(summary["med_err_deg"])]
         rows.append([words, counted(name, summary["n"]), *values, *believed])
     commits = {records[name]["commit"] for name in WORDS if name in records}
@@ -150,8 +150,7 @@ def table_in_words(results: Path) -> str:
     if followed:
         rows.insert(-1, video_row(followed["videos"]))  # PASCAL3D+ stays last
         commits.add(followed["commit"])
-    named = ", ".join(sorted(commits))
-    return "\n".join([*table_lines(rows), "", f"Commit {named}.", ""])
+    return f"{markdown_table(rows)}\nCommit {', '.join(sorted(commits))}.\n"
 
 
 def stored(path: Path) -> dict[str, Any]:
@@ -159,7 +158,7 @@ def stored(path: Path) -> dict[str, Any]:
     return read_json(path) if path.exists() else {}
 
 
-def video_row(videos: Sequence[Mapping[str, Any]]) -> list[str]:
+def video_row(videos: Sequence[Mapping[str, Any]]) -> list[object]:
     """The row of the frames that scripts/videos.py followed."""
     errors = [error for video in videos for error in video["errors_deg"]]
     verdicts = [verdict for video in videos for verdict in video["verdicts"]]
@@ -167,11 +166,11 @@ def video_row(videos: Sequence[Mapping[str, Any]]) -> list[str]:
     right = sum(error < RIGHT for error in errors) / len(errors)
     return [
         f"Frames of {len(videos)} videos, each followed from its first frame",
-        str(len(errors)),
+        len(errors),
         percent(right),
         degrees(median(errors)),
-        str(len(trusted)),
-        str(sum(error < RIGHT for error in trusted)),
+        len(trusted),
+        sum(error < RIGHT for error in trusted),
     ]
 
 
@@ -184,19 +183,16 @@ def table(results: Path) -> str:
         ("Poses on BOP sets", "bop", BOP, bop_cells),
     ):
         chosen = [r for r in records if r["summary"]["settings"]["dataset"] == kind]
-        if chosen:
-            body = "\n".join(
-                table_lines(
-                    [columns.split(" | "), *(cells(r["name"], r["summary"]) for r in chosen)]
-                )
-            )
-            sets = {}
-            for r in chosen:
-                sets.setdefault(note(r), []).append(r["name"])
-            notes = "\n".join(
-                f"- {', '.join(names)}: {conditions}" for conditions, names in sets.items()
-            )
-            parts.append(f"**{title}.** {definition}\n\n{body}\n\n{notes}\n")
+        if not chosen:
+            continue
+        rows = [columns.split(" | ")]
+        sets = {}
+        for each in chosen:
+            rows.append(cells(each["name"], each["summary"]))
+            sets.setdefault(note(each), []).append(each["name"])
+        notes = [f"- {', '.join(names)}: {conditions}" for conditions, names in sets.items()]
+        lines = [f"**{title}.** {definition}", "", markdown_table(rows), *notes, ""]
+        parts.append("\n".join(lines))
     return "\n".join(parts)
 
 
@@ -213,33 +209,32 @@ def note(record: dict[str, Any]) -> str:
     )
 
 
-def pascal3d_cells(name: str, s: dict[str, Any]) -> list[str]:
-    easy = s["subsets"]["easy"]
-    aware = s["symmetry_aware"]
-    values = [
-        percent(s["acc_pi_6"]),
-        percent(s["acc_pi_18"]),
-        degrees(s["med_err_deg"]),
-        percent(aware["acc_pi_6"]),
-    ]
+def pascal3d_cells(name: str, summary: dict[str, Any]) -> list[object]:
+    easy = summary["subsets"]["easy"]
     return [
         name,
-        str(s["n"]),
-        *values,
+        summary["n"],
+        percent(summary["acc_pi_6"]),
+        percent(summary["acc_pi_18"]),
+        degrees(summary["med_err_deg"]),
+        percent(summary["symmetry_aware"]["acc_pi_6"]),
         percent(easy["acc_pi_6"]),
         degrees(easy["med_err_deg"]),
     ]
 
 
-def bop_cells(name: str, s: dict[str, Any]) -> list[str]:
-    whole = s["subsets"]["unoccluded"]
-    values = [percent(s["acc_15_deg"]), percent(s["acc_30_deg"]), degrees(s["med_err_deg"])]
-    values += [percent(s[key]) for key in ("add_recall_0.1d", "mssd_ar", "mspd_ar")]
+def bop_cells(name: str, summary: dict[str, Any]) -> list[object]:
+    whole = summary["subsets"]["unoccluded"]
     return [
         name,
-        counted(name, s["n"]),
-        *values,
-        str(whole["n"]),
+        counted(name, summary["n"]),
+        percent(summary["acc_15_deg"]),
+        percent(summary["acc_30_deg"]),
+        degrees(summary["med_err_deg"]),
+        percent(summary["add_recall_0.1d"]),
+        percent(summary["mssd_ar"]),
+        percent(summary["mspd_ar"]),
+        whole["n"],
         percent(whole["acc_30_deg"]),
     ]
 
@@ -248,11 +243,9 @@ def counted(name: str, n: int) -> str:
     """The number of objects, with the numbers of views and lightings if the set has several
     lightings."""
     lightings = LIGHTINGS.get(name, 1)
-    return (
-        str(n)
-        if lightings == 1 or n % lightings
-        else f"{n} ({n // lightings} views x {lightings} lightings)"
-    )
+    if lightings == 1 or n % lightings:
+        return str(n)
+    return f"{n} ({n // lightings} views x {lightings} lightings)"
 
 
 def percent(fraction: float | None) -> str:

@@ -42,13 +42,12 @@ from scripts._shared import parser_of, read_json, write_json
 from scripts.scenes.families import FAMILIES, random_shape
 from scripts.scenes.materials import random_texture
 from scripts.scenes.packages import package
-from scripts.scenes.scene import Scene, View, camera_path, cut, shelf, simulate_camera, single
+from scripts.scenes.scene import SIZE, Scene, View, camera_path, cut, shelf, simulate_camera, single
 from scripts.scenes.surfaces import Array, Rng
 from scripts.scenes.textured import Placed, TexturedMesh, plain_texture
 from scripts.scenes.tied import FAMILIES as TIED_FAMILIES
 from scripts.scenes.tied import tied_shape
 
-SIZE = (480, 640)  # of photographs
 KINDS = ("printed", "shelf", "furniture", "shapes", "tied")
 CADS = ("exact", "similar", "wrong", "print", "mirrored", "variant")
 # fraction of the surface that has the same material after a symmetry of the appearance
@@ -335,7 +334,6 @@ def full_shelf(objects: Packages, options: Namespace, rng: Rng) -> tuple[Scene, 
         list(annotated.values()),
         objects.texture,
         rng,
-        size=SIZE,
         occlusion=options.occlusion,
         cameras=options.cameras,
     )
@@ -357,7 +355,6 @@ def lone_object(
         objects.clutter,
         objects.texture,
         rng,
-        size=SIZE,
         upright=index % 2 == 0,
         occluded=bool(rng.random() < 0.3 and attempt < 12),
         cameras=options.cameras,
@@ -373,7 +370,7 @@ def lone_object(
     if options.cut:
         fraction = float(rng.uniform(*options.cut))
         hull = scene.shapes[0].hull
-        views = [cut(view, hull, SIZE, fraction, rng) for view in scene.views]
+        views = [cut(view, hull, fraction, rng) for view in scene.views]
         scene = replace(scene, views=views)
     return scene, {shown: (named, objects.mesh(named))}
 

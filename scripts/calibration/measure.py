@@ -54,22 +54,19 @@ def symmetries_of(sample: Row, registrar: cr.Registrar | None = None) -> Tensor:
     that an exact mesh without colours has for the registrar, unless a notable feature of it tells
     them apart."""
     listed = sample["model_info"].get("symmetries_discrete", [])
-    known = [
-        torch.eye(3).double()[None],
-        *(torch.tensor(values).view(1, 4, 4)[:, :3, :3].double() for values in listed),
-    ]
-    found = None
+    known = [torch.eye(4).double()[None], torch.tensor(listed).double().view(-1, 4, 4)]
     if registrar is not None and not registrar.telling_symmetries.notable:
         found = registrar.symmetries_of(exact=True)
-    return torch.cat(known if found is None else [*known, found[:, :3, :3].double()])
+        if found is not None:
+            known.append(found.double())
+    return torch.cat(known)[:, :3, :3]
 
 
 def errors_of(R: Tensor, sample: Row, S: Tensor | None = None) -> Tensor:
     """(N,) degrees between rotations (N, 3, 3) and the truth, up to symmetries ``S`` (S, 3, 3)."""
     S = symmetries_of(sample) if S is None else S
-    return cr.rotation_error(R[:, None].double(), (sample["rotation"].double() @ S)[None]).amin(
-        dim=1
-    )
+    truths = sample["rotation"].double() @ S
+    return cr.rotation_error(R[:, None].double(), truths[None]).amin(dim=1)
 
 
 def truth_of(sample: Row) -> Tensor:
@@ -122,10 +119,9 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
 def true_centre(sample: Row) -> Tensor:
     """(3,) middle of the model's box at the true pose, in mm."""
     info = sample["model_info"]
-    middle = torch.tensor(
-        [info[f"min_{c}"] + 0.5 * info[f"size_{c}"] for c in "xyz"], dtype=torch.float64
-    )
-    return sample["rotation"].double() @ middle + sample["translation"].double()
+    middle = [info[f"min_{c}"] + 0.5 * info[f"size_{c}"] for c in "xyz"]
+    centre = sample["rotation"].double() @ torch.tensor(middle, dtype=torch.float64)
+    return centre + sample["translation"].double()
 
 
 def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
@@ -135,12 +131,11 @@ def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
     K = sample["camera_matrix"].double()
     generator = torch.Generator().manual_seed(sample["scene_id"])
     for degrees, fraction in (*STARTS, (0.0, 0.0)):
-        axis = torch.nn.functional.normalize(
-            torch.randn(3, generator=generator, dtype=torch.float64), dim=0
-        )
+        vector = torch.randn(3, generator=generator, dtype=torch.float64)
+        turn = rotation_from_axis_angle(np.radians(degrees) * vector / vector.norm())
         sign = 1.0 if torch.rand((), generator=generator) < 0.5 else -1.0
         start = T.clone()
-        start[:3, :3] = rotation_from_axis_angle(axis * np.radians(degrees)) @ T[:3, :3]
+        start[:3, :3] = turn @ T[:3, :3]
         start[:3, 3] *= 1.0 + sign * fraction
         absent = degrees == fraction == 0.0
         result = registrar.refine([(other if absent else sample)["image"]], K, [start])[0]
@@ -265,15 +260,17 @@ def measured(
     name: str,
 ) -> list[Row]:
     """Rows of tasks with keys, and of those that a file holds; finished ones are kept in it."""
-    done = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
-    known = {json.dumps(entry["task"]) for entry in done}
+    known = {}
+    if out.exists():
+        for line in out.read_text().splitlines():
+            entry = json.loads(line)
+            known[json.dumps(entry["task"])] = entry["rows"]
     new = [(key, task) for key, task in tasks if json.dumps(key) not in known]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, out.open("a") as file:
-        found = pool.map(measure_one, [task for _, task in new])
-        for (key, _), rows in zip(
-            new, tqdm(found, total=len(new), desc=name, unit="mesh"), strict=True
-        ):
-            done.append({"task": key, "rows": rows})
-            file.write(json.dumps(done[-1]) + "\n")
+        results = pool.map(measure_one, [task for _, task in new])
+        bar = tqdm(results, total=len(new), desc=name, unit="mesh")
+        for (key, _), rows in zip(new, bar, strict=True):
+            known[json.dumps(key)] = rows
+            file.write(json.dumps({"task": key, "rows": rows}) + "\n")
             file.flush()
-    return [row for entry in done for row in entry["rows"]]
+    return [row for rows in known.values() for row in rows]

@@ -32,6 +32,7 @@ from typing import Any, TypeAlias
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 import curvireg_torch as cr
@@ -101,12 +102,12 @@ def stretched(image: Tensor, box: Tensor, K: Tensor) -> Case:
     """Wider by ``STRETCH``, with the same focal length in both directions."""
     H, W = image.shape[-2:]
     wide = round(STRETCH * W)
-    picture = cv2.resize(image.permute(1, 2, 0).numpy(), (wide, H), interpolation=cv2.INTER_LINEAR)
+    picture = F.interpolate(image[None], (H, wide), mode="bilinear")[0]
     box = box.clone()
     box[[0, 2]] *= wide / W
     wrong = K.clone()
     wrong[0, 2] *= wide / W
-    return "stretched", torch.from_numpy(picture).permute(2, 0, 1), box, wrong
+    return "stretched", picture, box, wrong
 
 
 def distorted(image: Tensor, box: Tensor, K: Tensor) -> Case:
@@ -114,8 +115,8 @@ def distorted(image: Tensor, box: Tensor, K: Tensor) -> Case:
     H, W = image.shape[-2:]
     camera = K.numpy()
     lens = np.array(BARREL)
-    pixels = np.stack(np.meshgrid(np.arange(W), np.arange(H)), axis=-1).astype(np.float64)
-    source = cv2.undistortPoints(pixels.reshape(-1, 1, 2), camera, lens, P=camera)
+    pixels = np.mgrid[0:H, 0:W][::-1].reshape(2, -1).T.astype(np.float64)
+    source = cv2.undistortPoints(pixels, camera, lens, P=camera)
     source = source.reshape(H, W, 2).astype(np.float32)
     picture = cv2.remap(
         image.permute(1, 2, 0).numpy(),
@@ -126,9 +127,11 @@ def distorted(image: Tensor, box: Tensor, K: Tensor) -> Case:
     )
     x0, y0, x1, y1 = box.tolist()
     x, y = np.meshgrid(np.linspace(x0, x1, 21), np.linspace(y0, y1, 21))
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(camera).T
-    seen = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera, lens)[0].reshape(-1, 2)
-    corners = np.concatenate([seen.min(axis=0), seen.max(axis=0)])
+    points = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    rays = points @ np.linalg.inv(camera).T
+    origin = np.zeros(3)
+    seen, _ = cv2.projectPoints(rays, origin, origin, camera, lens)
+    corners = np.concatenate([seen.min(axis=(0, 1)), seen.max(axis=(0, 1))])
     return "distorted", torch.from_numpy(picture).permute(2, 0, 1), torch.from_numpy(corners), K
 
 
@@ -138,11 +141,12 @@ def cropped(image: Tensor, box: Tensor) -> Case:
     side = torch.maximum((CROPPED * size).round(), (box[2:] - box[:2]).ceil() + 8.0)
     middle = 0.5 * (box[:2] + box[2:])
     rightmost = (size - side).clamp(min=0.0)
-    farthest = torch.where(middle > 0.5 * size, rightmost, 0.0)
-    corner = torch.minimum(torch.maximum(farthest, box[2:] + 4.0 - side), box[:2] - 4.0)
+    corner = torch.where(middle > 0.5 * size, rightmost, 0.0)
+    corner = torch.maximum(corner, box[2:] + 4.0 - side)
+    corner = torch.minimum(corner, box[:2] - 4.0)
     corner = torch.minimum(corner.round().clamp(min=0.0), rightmost)
-    x, y = (int(value) for value in corner)
-    wide, high = (int(value) for value in side)
+    x, y = corner.int().tolist()
+    wide, high = side.int().tolist()
     part = image[:, y : y + high, x : x + wide].contiguous()
     return "cropped", part, box - torch.cat([corner, corner]), None
 

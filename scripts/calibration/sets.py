@@ -53,20 +53,10 @@ SHARES = {
 """Assumed shares of the photographs that users have; those of the other sets have the rest, each
 the same weight."""
 
-ABSENT = (
-    "print",
-    "mirrored",
-    "wrong",
-    "estimated_wrong",
-)  # sets whose photographs do not show the mesh: no pose is right
-UPRIGHT = (
-    "furniture",
-    "shapes",
-    "estimated_shapes",
-    "furniture_similar",
-    "similar",
-    "sequences",
-)  # sets of which half stand upright
+# sets whose photographs do not show the mesh: no pose is right
+ABSENT = ("print", "mirrored", "wrong", "estimated_wrong")
+# sets of which half stand upright
+UPRIGHT = ("furniture", "shapes", "estimated_shapes", "furniture_similar", "similar", "sequences")
 GREY = {
     "shapes": 3,
     "packages": 3,
@@ -98,11 +88,9 @@ KINDS = {"refinement": "refined", "tracking": "sequences", "detection": "detecte
 def sets_of(models: Sequence[str], meshes: Path | None) -> list[str]:
     """Sets of the models, without those of furniture where there is none."""
     names = dict.fromkeys(name for model in models for name in MODELS[model])
-    return [
-        name
-        for name in names
-        if meshes is not None or "furniture" not in SETS[photographs_of(name)][1]
-    ]
+    if meshes is not None:
+        return list(names)
+    return [name for name in names if "furniture" not in SETS[photographs_of(name)][1]]
 
 
 def photographs_of(name: str) -> str:

@@ -35,7 +35,7 @@ from curvireg_torch.evaluation.compare import read_run
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.terms import Appearance, BoxShape
 from curvireg_torch.utils.executors import Workers
-from scripts._shared import commit, parser_of, table_lines, update_page
+from scripts._shared import commit, markdown_table, parser_of, update_page
 from scripts.paper.measures import Estimate, bootstrap
 
 RIGHT_DEG = 30.0
@@ -154,13 +154,13 @@ def table(sets: Mapping[str, Scores]) -> str:
     }
     cells = [["change", *(f"`{name}`, N {n}" for name, n in counts.items())]]
     for k, (step, _) in enumerate(pipelines("any")):
-        cells.append([step, *(str(scores.get(k, "-")) for scores in sets.values())])
+        cells.append([step, *(scores.get(k, "-") for scores in sets.values())])
     text = (
         "Share of the rotations within 30° with its 95 % interval by bootstrap of the CADs (none "
         "for one or two of them), and median error, up to symmetries where they are known; each "
         "line adds one change to the line above"
     )
-    return "\n".join([f"{text}. Commit {commit()}.", "", *table_lines(cells), ""])
+    return f"{text}. Commit {commit()}.\n\n{markdown_table(cells)}"
 
 
 def main() -> int:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from curvireg_torch.filters.focus import PAPER_THRESHOLD
-from scripts._shared import table_lines
+from scripts._shared import markdown_table
 from scripts.paper import printed
 from scripts.paper.measures import Estimate, bootstrap
 
@@ -54,8 +54,8 @@ class Table:
 
     def markdown(self) -> str:
         """Title, definition and table; means with their intervals."""
-        lines = table_lines([self.columns, *([str(cell) for cell in row] for row in self.rows)])
-        return "\n".join([f"### {self.title}", "", self.definition, "", *lines, ""])
+        table = markdown_table([self.columns, *self.rows])
+        return f"### {self.title}\n\n{self.definition}\n\n{table}"
 
 
 class Records:

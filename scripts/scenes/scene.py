@@ -28,6 +28,7 @@ Draw: TypeAlias = Callable[[Rng], TexturedMesh]
 View: TypeAlias = tuple[Array, Array, Array]
 """Rotation (3, 3) and translation (3,), scene -> camera, and camera matrix (3, 3)."""
 
+SIZE = (480, 640)  # of photographs
 # degrees, and fraction of the distance, between two frames of a sequence
 MAX_TURN = 5.0
 MAX_SHIFT = 0.05
@@ -61,7 +62,6 @@ def single(
     textures: Callable[[Rng], Array],
     rng: Rng,
     *,
-    size: tuple[int, int],
     upright: bool = True,
     occluded: bool = False,
     cameras: int = 1,
@@ -71,10 +71,10 @@ def single(
     turn = np.eye(3) if upright else random_rotation(rng)
     target = Placed.standing(mesh, turn, 1.0 / mesh.radius, obj_id=obj_id)
     hull = target.hull
-    fill = rng.uniform(0.25, 0.65) * min(size)
+    fill = rng.uniform(0.25, 0.65) * min(SIZE)
     elevation = float(rng.choice([rng.uniform(-4, 25), rng.uniform(5, 60)]))
     azimuth = rng.uniform(0, 360)
-    view = look_at(hull, size, rng, fill=fill, azimuth=azimuth, elevation=elevation)
+    view = look_at(hull, rng, fill=fill, azimuth=azimuth, elevation=elevation)
     R, t, _ = view
     eye = -R.T @ t
     shapes = [target]
@@ -99,7 +99,6 @@ def shelf(
     textures: Callable[[Rng], Array],
     rng: Rng,
     *,
-    size: tuple[int, int],
     occlusion: float = 0.6,
     cameras: int = 1,
 ) -> Scene:
@@ -143,19 +142,17 @@ def shelf(
         shapes.append(_quad(rim, wood))
     wall = [(x0, back, -1), (x1, back, -1), (x1, back, top), (x0, back, top)]
     shapes.append(_quad(wall, Texture(textures(rng))))
-    fill = rng.uniform(0.7, 1.0) * max(size)
+    fill = rng.uniform(0.7, 1.0) * max(SIZE)
     azimuth = rng.normal(0, 18)
     elevation = rng.uniform(0, 25)
-    view = look_at(points, size, rng, fill=fill, azimuth=azimuth, elevation=elevation)
+    view = look_at(points, rng, fill=fill, azimuth=azimuth, elevation=elevation)
     return _lit(shapes, view, points, cameras, rng)
 
 
-def look_at(
-    points: Array, size: tuple[int, int], rng: Rng, *, fill: float, azimuth: float, elevation: float
-) -> View:
+def look_at(points: Array, rng: Rng, *, fill: float, azimuth: float, elevation: float) -> View:
     """A view whose box around points (P, 3) is ``fill`` px long and lies near the middle; angles in
     degrees."""
-    H, W = size
+    H, W = SIZE
     sides = np.array([W, H])
     field_of_view = np.radians(rng.uniform(22, 60))
     focal = 0.5 * max(H, W) / np.tan(field_of_view / 2)
@@ -180,11 +177,11 @@ def look_at(
     return R, distance * ray - R @ middle, K
 
 
-def cut(view: View, points: Array, size: tuple[int, int], fraction: float, rng: Rng) -> View:
+def cut(view: View, points: Array, fraction: float, rng: Rng) -> View:
     """The view, turned so that about ``fraction`` of the outline of points (P, 3) lies outside the
     picture, at one side or at two."""
     R, t, K = view
-    H, W = size
+    H, W = SIZE
     seen = (points @ R.T + t) @ K.T
     pixels = seen[:, :2] / seen[:, 2:]
     middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
@@ -202,7 +199,7 @@ def cut(view: View, points: Array, size: tuple[int, int], fraction: float, rng: 
         target = np.where(side == 0, middle, border + side * part * reach)
         turn = _turn_to(to_ray @ (*middle, 1.0), to_ray @ (*target, 1.0))
         pose = transform(torch.from_numpy(turn @ R), torch.from_numpy(turn @ t))
-        if outside_fraction(hull, pose, torch.from_numpy(K), size) < fraction:
+        if outside_fraction(hull, pose, torch.from_numpy(K), SIZE) < fraction:
             low = part
         else:
             high = part

@@ -3,7 +3,7 @@
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -35,17 +35,6 @@ element face {faces}
 property list uchar int vertex_indices
 end_header
 """
-
-
-class Paint(Protocol):
-    """Colours of a surface."""
-
-    gloss: float
-    shininess: float
-
-    def colours(self, points: Array, uv: Array) -> Array:
-        """(N, 3) linear colours at points (N, 3) of the object's frame with texture coordinates (N,
-        2)."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +69,8 @@ def plain_texture(rng: Rng) -> Texture:
 @dataclass(frozen=True)
 class TexturedMesh:
     """Triangles (F, 3, 3) in metres, z up; normals (F, 3, 3), texture coordinates (F, 3, 2), and
-    paint numbers (F,)."""
+    paint numbers (F,). A paint is a :class:`Texture` or a material: it has gloss, shininess, and
+    colours of points."""
 
     triangles: Array
     normals: Array
@@ -126,7 +116,7 @@ class TexturedMesh:
             paints=tuple(map(paint_of, parts)),
         )
 
-    def recoloured(self, paint: Paint) -> "TexturedMesh":
+    def recoloured(self, paint: Any) -> "TexturedMesh":
         """The mesh with one paint everywhere."""
         return replace(self, paint=np.zeros(len(self.triangles), int), paints=(paint,))
 
@@ -159,35 +149,35 @@ class TexturedMesh:
         """Texture coordinates (F, 3, 2) in one (h, w, 3) picture of all textures, repeated where
         faces need it."""
         uv = self.uv - np.floor(self.uv.min(axis=1, keepdims=True))
-        rows = []
-        top = []
-        width = 0
+        counts = []
+        tiles = []
         for k, texture in enumerate(self.paints):
-            here = self.paint == k
-            most = float(uv[here].max(initial=1.0))
+            most = float(uv[self.paint == k].max(initial=1.0))
             n = 1 if most < 1 + 1e-3 else min(MAX_REPEATS, int(np.ceil(most)))
             image = texture.picture
-            if image.shape[0] == 1 or n == 1:
-                image = cv2.resize(image, (8, 8)) if image.shape[0] == 1 else image
-            else:
+            if len(image) == 1:
+                image = cv2.resize(image, (8, 8))
+            elif n > 1:
                 side = MAX_TEXTURE // n
-                image = cv2.resize(
-                    image, (side, min(side, image.shape[0])), interpolation=cv2.INTER_AREA
-                )
-            rows.append(np.pad(np.tile(image, (n, n, 1)), ((1, 1), (1, 1), (0, 0)), mode="edge"))
-            top.append((rows[-1].shape[0] - 2, rows[-1].shape[1] - 2, n))
-            width = max(width, rows[-1].shape[1])
-        picture = np.concatenate(
-            [np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), mode="edge") for r in rows]
-        )
-        first = np.cumsum([0, *(len(r) for r in rows)])
+                size = (side, min(side, len(image)))
+                image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            counts.append(n)
+            tiles.append(np.tile(image, (n, n, 1)))
+        width = 2 + max(tile.shape[1] for tile in tiles)
+        height = sum(len(tile) + 2 for tile in tiles)
+        rows = []
         out = np.zeros_like(uv)
-        for k, (high, wide, n) in enumerate(top):
+        top = 1  # each has a border of one pixel
+        for k, (n, tile) in enumerate(zip(counts, tiles, strict=True)):
+            high, wide, _ = tile.shape
+            border = ((1, 1), (1, width - wide - 1), (0, 0))
+            rows.append(np.pad(tile, border, mode="edge"))
             here = self.paint == k
             part = np.clip(uv[here] / n, 0.0, 1.0)
             out[here, :, 0] = (1 + part[..., 0] * wide) / width
-            out[here, :, 1] = 1.0 - (first[k] + 1 + (1.0 - part[..., 1]) * high) / len(picture)
-        return out, picture
+            out[here, :, 1] = 1.0 - (top + (1.0 - part[..., 1]) * high) / height
+            top += high + 2
+        return out, np.concatenate(rows)
 
 
 @dataclass(frozen=True)

@@ -225,7 +225,7 @@ def table(record: dict[str, Any]) -> str:
         rows = [row[:-1] for row in rows]
     many = f"{record['photographs']} photographs in `many`"
     stamp = f"{20 * 4**SUBDIVISIONS} faces, {many}; {record['processor']}, {record['date']}."
-    return "\n".join([*_shared.table_lines(rows), "", stamp, ""])
+    return f"{_shared.markdown_table(rows)}\n{stamp}\n"
 
 
 def cell(measurement: dict[str, float]) -> str:

@@ -20,7 +20,6 @@ from scripts.scenes.textured import Placed, TexturedMesh
 
 CLUTTER = 500  # shapes that clutter is drawn from; each process builds them once
 MARGIN = 0.1  # around the object's box, as in BankSettings
-PHOTOGRAPH = (480, 640)  # the crop's scene is composed for a photograph of this size
 
 
 class GeneratedScenes(Dataset[dict[str, Tensor]]):
@@ -61,8 +60,7 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
         shape = _painted(np.random.default_rng((self._seed, index)), rng)
         upright = bool(rng.random() < self._upright)
         occluded = bool(rng.random() < 0.3)
-        options = {"size": PHOTOGRAPH, "upright": upright, "occluded": occluded}
-        scene = single(shape, 1, _clutter, random_texture, rng, **options)
+        scene = single(shape, 1, _clutter, random_texture, rng, upright=upright, occluded=occluded)
         R, t, _ = scene.views[0]
         target = scene.shapes[0]
         centre = R @ target.points(shape.centre) + t

@@ -14,7 +14,7 @@ from curvireg_torch.synthetic import example_mesh
 from scripts.benchmark.make import TWIN, Packages, Shapes, Tied
 from scripts.calibration import fits, measure, sets
 from scripts.calibration.calibrate import covariance_quality
-from scripts.scenes.scene import cut, look_at
+from scripts.scenes.scene import SIZE, cut, look_at
 
 
 def options(**changes):
@@ -104,11 +104,11 @@ def test_symmetries_of_shapes_keep_their_materials():
 def test_cut_puts_a_fraction_of_the_object_outside(fraction):
     rng = np.random.default_rng(4)
     points = Tied(options()).mesh(1).hull
-    view = look_at(points, (480, 640), rng, fill=250.0, azimuth=30.0, elevation=20.0)
-    R, t, K = cut(view, points, (480, 640), fraction, rng)
+    view = look_at(points, rng, fill=250.0, azimuth=30.0, elevation=20.0)
+    R, t, K = cut(view, points, fraction, rng)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3], pose[:3, 3] = torch.from_numpy(R), torch.from_numpy(t)
-    found = outside_fraction(torch.from_numpy(points), pose, torch.from_numpy(K), (480, 640))
+    found = outside_fraction(torch.from_numpy(points), pose, torch.from_numpy(K), SIZE)
     assert found == pytest.approx(fraction, abs=0.02)
 
 
