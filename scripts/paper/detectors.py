@@ -76,10 +76,10 @@ def laplacian_of_gaussian(image: Tensor, *, fraction: float = 0.04) -> Tensor:
     _, _, xx, yy, _ = central_derivatives(smooth(image, 2.0))
     laplacian = F.pad(xx + yy, (0, 1, 0, 1), mode="replicate")
     here = laplacian[..., :-1, :-1]
-    steps = [
-        torch.where(here * x < 0, (here - x).abs(), 0.0)
-        for x in (laplacian[..., :-1, 1:], laplacian[..., 1:, :-1])
-    ]
+    steps = []
+    for neighbour in (laplacian[..., :-1, 1:], laplacian[..., 1:, :-1]):
+        crosses = here * neighbour < 0
+        steps.append(torch.where(crosses, (here - neighbour).abs(), 0.0))
     response = torch.maximum(*steps)
     return strongest_points(response, response > 0, fraction)
 
@@ -116,9 +116,8 @@ def fuzzy_edges(image: Tensor, *, width: float = 0.1, fraction: float = 0.04) ->
     relative = gradient / torch.where(peak > 0, peak, 1.0)
     zero = torch.exp(-0.5 * (relative / width).square()).amin(dim=1, keepdim=True)
     length = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
-    return field_points(
-        (1.0 - zero) * gradient / torch.where(length > 0, length, 1.0), fraction=fraction
-    )
+    edges = (1.0 - zero) * gradient / torch.where(length > 0, length, 1.0)
+    return field_points(edges, fraction=fraction)
 
 
 SIDES = (9, 15, 21, 27, 39, 51, 75, 99)
@@ -133,13 +132,11 @@ def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.
 
     Points are maxima above ``threshold`` > 0 over 3 x 3 px and three neighbouring sides.
     """
-    sides = [side for side in SIDES if side <= max(21, *image.shape[-2:])]
     H, W = image.shape[-2:]
+    sides = [side for side in SIDES if side <= max(21, H, W)]
     greys = F.pad(image.double(), (50,) * 4, mode="replicate").numpy()[:, 0]
     found = [[skimage.feature.hessian_matrix_det(x, side / 3) for side in sides] for x in greys]
-    volume = torch.tensor(np.array(found), dtype=torch.float32).view(
-        len(image), 1, len(sides), H + 100, W + 100
-    )
+    volume = torch.tensor(np.array(found), dtype=torch.float32)[:, None]
     # scikit-image's result is one pixel too far up and left
     volume = volume[..., 49 : 49 + H, 49 : 49 + W]
     inner = volume[:, :, 1:-1]
@@ -169,10 +166,12 @@ def sift(image: Tensor, *, fraction: float = 0.04) -> Tensor:
     points = torch.zeros(image.shape, dtype=torch.bool)
     H, W = image.shape[-2:]
     sift_detector = cv2.SIFT.create(nfeatures=max(1, int(fraction * H * W)))
-    for i, grey in enumerate((255.0 * image[:, 0].clamp(0.0, 1.0)).round().byte()):
+    greys = (255.0 * image[:, 0].clamp(0.0, 1.0)).round().byte()
+    for mask, grey in zip(points[:, 0], greys, strict=True):
         for keypoint in sift_detector.detect(grey.numpy(), None):
-            x, y = (min(max(round(c), 0), n - 1) for c, n in zip(keypoint.pt, (W, H), strict=True))
-            points[i, 0, y, x] |= keypoint.response > 0
+            x = min(max(round(keypoint.pt[0]), 0), W - 1)
+            y = min(max(round(keypoint.pt[1]), 0), H - 1)
+            mask[y, x] |= keypoint.response > 0
     return points
 
 

@@ -96,7 +96,7 @@ def detected(crop: Tensor, share: float) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def measure_points(cases: list[Case], settings: BankSettings) -> list[Record]:
+def measure_points(cases: list[Case], settings: BankSettings, _pose: str) -> list[Record]:
     """Agreement of the points of photographs with those of the views at their true poses."""
     mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
     describers = {
@@ -316,3 +316,6 @@ def _focus_of(case: Case, mesh: Mesh, matcher: ViewMatcher, azimuths: Tensor) ->
             "top 20": float(errors[order[:20]].min()),
         }
     return record
+
+
+MEASURES = {"points": measure_points, "views": measure_views, "focus": measure_focus}

@@ -90,15 +90,10 @@ def measure(
     cases: list[Case], phase: str, settings: BankSettings, pose: str
 ) -> list[dict[str, Any]]:
     """Records of the cases of one mesh."""
-    from scripts.paper.measure import measure_focus, measure_points, measure_views
+    from scripts.paper.measure import MEASURES
 
     start = time.process_time()
-    if phase == "points":
-        found = measure_points(cases, settings)
-    elif phase == "focus":
-        found = measure_focus(cases, settings, pose)
-    else:
-        found = measure_views(cases, settings, pose)
+    found = MEASURES[phase](cases, settings, pose)
     seconds = (time.process_time() - start) / len(cases)
     same = {"cad": cases[0].mesh_path, "seconds": seconds, "commit": commit()}
     return [

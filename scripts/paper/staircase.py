@@ -14,7 +14,7 @@ import math
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,15 +22,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
 sys.path.insert(0, str(REPOSITORY))
 
-from curvireg_torch.data import BOPDataset, Pascal3DPlus
 from curvireg_torch.errors import CurviregError, InvalidInputError
-from curvireg_torch.evaluation import (
-    Benchmark,
-    BOPBenchmark,
-    Pascal3DBenchmark,
-    Protocol,
-    evaluate,
-)
+from curvireg_torch.evaluation import DATASETS, Benchmark, Protocol, evaluate
 from curvireg_torch.evaluation.compare import read_run
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.terms import Appearance, BoxShape
@@ -92,13 +85,11 @@ def pipelines(pose: str) -> Iterator[tuple[str, Pipeline]]:
 
 def benchmark_of(root: Path) -> Benchmark:
     """The objects of a PASCAL3D+ release or a BOP set under the usual protocol."""
-    if (root / "CAD").is_dir():
-        return Pascal3DBenchmark(Pascal3DPlus(root), Protocol(pose="upright"))
-    return BOPBenchmark(BOPDataset(root), Protocol(pose="any"))
+    kind = DATASETS["pascal3d" if (root / "CAD").is_dir() else "bop"]
+    return kind.scored(kind.open(root), Protocol(pose=kind.pose))
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(NamedTuple):
     """Share of the rotations within 30 degrees, number of CADs, and median error in degrees."""
 
     right: Estimate
@@ -106,10 +97,10 @@ class Score:
     median: float
 
     def __str__(self) -> str:
-        low = self.right.low
-        high = self.right.high
-        interval = f" ({low:.2f} to {high:.2f})" if self.cads >= FEWEST_CADS else ""
-        return f"{self.right.mean:.2f}{interval}, {self.median:.0f}°"
+        text = f"{self.right.mean:.2f}"
+        if self.cads >= FEWEST_CADS:
+            text += f" ({self.right.low:.2f} to {self.right.high:.2f})"
+        return f"{text}, {self.median:.0f}°"
 
 
 Scores = Mapping[int, Score]
@@ -119,8 +110,9 @@ Scores = Mapping[int, Score]
 def climb(name: str, root: Path, options: argparse.Namespace) -> Scores:
     """Evaluate the steps of one set."""
     benchmark = benchmark_of(root)
-    entries = zip(benchmark.entries, benchmark.samples, strict=True)
-    cads = {entry.key: str(sample[benchmark.mesh]) for entry, sample in entries}
+    cads = {}
+    for entry, sample in zip(benchmark.entries, benchmark.samples, strict=True):
+        cads[entry.key] = str(sample[benchmark.mesh])
     scores = {}
     for k, (_, pipeline) in enumerate(pipelines(benchmark.protocol.pose)):
         if k not in (options.steps or [k]):
@@ -135,24 +127,26 @@ def climb(name: str, root: Path, options: argparse.Namespace) -> Scores:
         )
         if summary["skipped"]:
             print(f"staircase: {name}: left out: {dict(summary['skipped'])}", file=sys.stderr)
-        found = {key: each[benchmark.page_error] for key, each in read_run(folder).errors.items()}
-        known = {key: min(error, 180.0) for key, error in found.items() if not math.isnan(error)}
-        if known:
-            scores[k] = score_of(known, [cads[key] for key in known])
+        errors = []
+        of_cads = []
+        for key, each in read_run(folder).errors.items():
+            error = each[benchmark.page_error]
+            if not math.isnan(error):
+                errors.append(min(error, 180.0))
+                of_cads.append(cads[key])
+        if errors:
+            right = bootstrap([float(error < RIGHT_DEG) for error in errors], of_cads)
+            scores[k] = Score(right, len(set(of_cads)), statistics.median(errors))
     return scores
-
-
-def score_of(errors: Mapping[str, float], cads: list[str]) -> Score:
-    right = bootstrap([float(error < RIGHT_DEG) for error in errors.values()], cads)
-    return Score(right, len(set(cads)), statistics.median(errors.values()))
 
 
 def table(sets: Mapping[str, Scores]) -> str:
     """Markdown: one line for each step, one column for each set."""
-    counts = {
-        name: max((s.right.n for s in scores.values()), default=0) for name, scores in sets.items()
-    }
-    cells = [["change", *(f"`{name}`, N {n}" for name, n in counts.items())]]
+    header = ["change"]
+    for name, scores in sets.items():
+        count = max((score.right.n for score in scores.values()), default=0)
+        header.append(f"`{name}`, N {count}")
+    cells = [header]
     for k, (step, _) in enumerate(pipelines("any")):
         cells.append([step, *(scores.get(k, "-") for scores in sets.values())])
     text = (

@@ -85,13 +85,17 @@ class Records:
         columns: Sequence[str],
         rows: Sequence[Sequence[Cell | Value]],
     ) -> Table:
-        """A table with the means of values, which also says on how many they were measured."""
+        """A table with the means of values, which also says on how many they were measured; short
+        rows end in dashes."""
         cads = len({r["cad"] for r in self.records})
         text = (
             f"{definition} {self.what}, N = {len(self.records)} ({cads} CADs); in brackets 95 % "
             "by bootstrap of the CADs."
         )
-        cells = [[self.mean(cell) if callable(cell) else cell for cell in row] for row in rows]
+        cells = []
+        for row in rows:
+            means = [self.mean(cell) if callable(cell) else cell for cell in row]
+            cells.append([*means, *["-"] * (len(columns) - len(row))])
         return Table(name, title, text, columns, cells)
 
 
@@ -147,13 +151,18 @@ def detector_tables(records: Records) -> list[Table]:
     """IP, Hausdorff distance and number of points of each detector, and IP by class."""
     rows = []
     for name in records.records[0]["points"]:
-        ip = [_printed(means.get(name)) for means in (printed.IP, printed.WEB_IP)]
-        distances = printed.HAUSDORFF, printed.WEB_HAUSDORFF
-        hausdorff = [_printed(means.get(name), 0) for means in distances]
-        rows.append(
-            [name, at("ip", name), *ip, at("hausdorff", name), *hausdorff, at("points", name)]
-        )
-    rows.append(["any pixel (chance)", at("ip", "chance"), *["-"] * 6])
+        row = [
+            name,
+            at("ip", name),
+            _printed(printed.IP.get(name)),
+            _printed(printed.WEB_IP.get(name)),
+            at("hausdorff", name),
+            _printed(printed.HAUSDORFF.get(name), 0),
+            _printed(printed.WEB_HAUSDORFF.get(name), 0),
+            at("points", name),
+        ]
+        rows.append(row)
+    rows.append(["any pixel (chance)", at("ip", "chance")])
     text = (
         "IP: fraction of the photograph's points within 2 px of a point of the curvilinear "
         "saliency (CS) of the view at the true pose. HD: Hausdorff distance of the two sets, px of "
@@ -162,7 +171,7 @@ def detector_tables(records: Records) -> list[Table]:
         "published."
     )
     of_paper = ("paper, PASCAL3D+", "paper, web")
-    columns = ["detector", "IP", *of_paper, "HD", *(f"{name} " for name in of_paper), "points"]
+    columns = ["detector", "IP", *of_paper, "HD", "paper, PASCAL3D+ ", "paper, web ", "points"]
     of_class = {name: [at("ip", name)] for name in CLASS_DETECTORS}
     return [
         records.table("detectors", "Detectors: IP and Hausdorff distance", text, columns, rows),
@@ -210,10 +219,8 @@ def sensitivity_tables(records: Records) -> list[Table]:
             continue
         cells = [at("sensitivity", f"{name} {share:g} {eps:g}") for name in names]
         rows.append([f"{100 * share:g} %", f"{eps:g} px", *cells])
-    others = ["-"] * (len(names) - 1)
     for threshold in records.records[0]["threshold"]:
-        value = at("threshold", threshold)
-        rows.append(["4 %", f"2 px, threshold {threshold}", value, *others])
+        rows.append(["4 %", f"2 px, threshold {threshold}", at("threshold", threshold)])
     text = (
         "IP with other shares of the pixels that are points, in photograph and view, radii, and "
         "thresholds of MFC (the paper: .0067)."
@@ -226,12 +233,11 @@ def _right(variant: str, pair: str, rank: int) -> Value:
     return right_at(variant, pair, "top", slice(rank))
 
 
-def limit_rows(columns: int) -> list[list[Cell | Value]]:
+def limit_rows() -> list[list[Cell | Value]]:
     """What views drawn by lot, and the best view of the bank, would have, for each variant."""
-    others = ["-"] * (columns - 1 - len(VARIANTS))
     return [
-        [name, *(at(variant, key) for variant in VARIANTS), *others]
-        for name, key in (("a view by lot", "chance"), ("a right view is there", "ceiling"))
+        ["a view by lot", *(at(variant, "chance") for variant in VARIANTS)],
+        ["a right view is there", *(at(variant, "ceiling") for variant in VARIANTS)],
     ]
 
 
@@ -248,7 +254,7 @@ def precision_tables(records: Records) -> list[Table]:
         return [_right(variant, pair, 1) for variant in VARIANTS]
 
     rows = [[pair, *values(pair), _printed(printed.PRECISION[pair])] for pair in PAIRS]
-    rows += limit_rows(5)
+    rows += limit_rows()
     text = (
         f"Fraction of the photographs whose best view is within {RIGHT_DEG:g}° of the true one "
         "(the paper does not define its precision), before the search."
@@ -288,25 +294,24 @@ def rank_tables(records: Records) -> list[Table]:
 def angle_tables(records: Records) -> list[Table]:
     """Mean errors of elevation, azimuth, in-plane angle and distance."""
 
-    def beside(left: Sequence[str] | None, right: Sequence[str]) -> list[Cell | Value]:
-        """Cells of both in turn; of none, dashes."""
-        cells = []
-        for k in range(4):
-            cells.append("-" if left is None else at(*left, k))
-            cells.append(at(*right, k))
-        return cells
-
     rows = []
+
+    def add(name: str, *closest: str, estimated: Sequence[str] = ()) -> None:
+        """A row with the errors of the estimate, if there is one, and of the closest view."""
+        row = [name]
+        for k in range(len(PARTS)):
+            row.append(at(*estimated, k) if estimated else "-")
+            row.append(at(*closest, k))
+        rows.append(row)
+
     for variant in ("literal", "corrected"):
         name = NAMES[variant]
         for pair in REFINED_PAIRS:
-            found = beside((variant, pair, "est"), (variant, pair, "clo"))
-            rows.append([f"{name}, {pair}", *found])
+            add(f"{name}, {pair}", variant, pair, "clo", estimated=(variant, pair, "est"))
             if variant == "corrected":
-                refined = beside(None, (variant, pair, "refined"))
-                rows.append([f"{name}, {pair}, of refined views", *refined])
+                add(f"{name}, {pair}, of refined views", variant, pair, "refined")
                 rows.append([f"{pair}, paper", *printed.POSE_ERRORS[pair]])
-        rows.append([f"{name}, bank", *beside(None, (variant, "limit"))])
+        add(f"{name}, bank", variant, "limit")
     text = (
         "Mean absolute errors, angles in degrees, distance in percent (that at which the mesh "
         "fills the box, with the camera of the annotation; the paper's centimetres are of unknown "
@@ -355,7 +360,7 @@ def focus_tables(records: Records) -> list[Table]:
         [threshold, *cells(f"MFC {threshold}"), *cells(f"MFC x CS {threshold}")]
         for threshold in sorted({name.split()[-1] for name in names})
     ]
-    rows += [[name, *cells(name), "-", "-"] for name in ("MCS", "IG")]
+    rows += [[name, *cells(name)] for name in ("MCS", "IG")]
     text = (
         "Least CS of an edge, relative to the largest (the paper: e⁻⁵ = .0067, as for MCS): IP, "
         "and precision of the corrected ranking, of focus curves alone and weighted by CS."
@@ -389,6 +394,6 @@ def grid_tables(records: Records) -> list[Table]:
     rows = [
         [f"{n} x {n}", *(right_at(variant, f"grid {n}") for variant in VARIANTS)] for n in GRIDS
     ]
-    rows += limit_rows(4)
+    rows += limit_rows()
     text = "Precision of CS/MFC by the cells of the descriptor; the paper says that 8 x 8 is best."
     return [records.table("grids", "Grids", text, ["cells", *NAMES.values()], rows)]

@@ -66,7 +66,7 @@ def views(root):
 
 
 def test_points_of_the_true_view_are_repeated_most(root):
-    records = measure.measure_points(find_cases("web", root), SETTINGS)
+    records = measure.measure_points(find_cases("web", root), SETTINGS, "upright")
     assert {name.upper() for name in DETECTORS} == set(records[0]["points"])
     for record in records:
         for name in ("MFC", "MCS", "IG"):
