@@ -7,9 +7,13 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
 
 if TYPE_CHECKING:
     import resource
@@ -56,6 +60,14 @@ def write_json(path: Path, content: Any, indent: int = 2) -> None:
     part = path.with_name(f"{path.name}.{os.getpid()}")
     part.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
     part.replace(path)
+
+
+def in_processes(
+    function: Callable[[Any], Any], tasks: Sequence[Any], jobs: int, name: str, **options: Any
+) -> Iterator[Any]:
+    """Results of tasks in their order, with a bar; ``options`` are those of the processes."""
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), **options) as pool:
+        yield from tqdm(pool.map(function, tasks), total=len(tasks), desc=name)
 
 
 def stamp() -> dict[str, Any]:

@@ -21,10 +21,8 @@ object for scripts/calibration.
 import shutil
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +32,10 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
-from tqdm import tqdm
 
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.mesh import mesh_symmetries
-from scripts._shared import parser_of, read_json, write_json
+from scripts._shared import in_processes, parser_of, read_json, write_json
 from scripts.scenes.families import FAMILIES, random_shape
 from scripts.scenes.materials import random_texture
 from scripts.scenes.packages import package
@@ -184,7 +181,9 @@ class Variants(Shapes):
         elif change == "moved":
             shift = axis * mesh.radius * rng.uniform(0.2, 0.5)
         else:
-            turn = turn * float(rng.choice([rng.uniform(0.5, 0.75), rng.uniform(1.3, 1.6)]))
+            smaller = rng.uniform(0.5, 0.75)
+            larger = rng.uniform(1.3, 1.6)
+            turn = turn * float(rng.choice([smaller, larger]))
         own = mesh.triangles[part]
         rest = mesh.triangles[~part].reshape(-1, 3)
         points = own.reshape(-1, 3)
@@ -233,8 +232,9 @@ class Furniture(Packages):
         self.ids = list(self.rows)
         if options.cad == "similar":
             self.ids = [k for k in self.rows if self._siblings(k)]
-        textures = sorted(p for m in rows for p in (self.folder / m["path"]).parent.glob("*.jpg"))
-        self.photographs = [p for p in textures if p.stat().st_size > 8000]
+        folders = [(self.folder / row["path"]).parent for row in rows]
+        pictures = sorted(path for folder in folders for path in folder.glob("*.jpg"))
+        self.photographs = [path for path in pictures if path.stat().st_size > 8000]
         self.names = "shape_symmetries" if options.cad == "similar" else "look_symmetries"
 
     @property
@@ -255,17 +255,25 @@ class Furniture(Packages):
         return self.rows[obj_id]["kind"] or self.rows[obj_id]["like"]
 
     def _siblings(self, obj_id: int) -> list[int]:
-        row = self.rows[obj_id]
-        same = [k for k, m in self.rows.items() if row["kind"] and m["kind"] == row["kind"]]
-        return [k for k in same if self.rows[k]["like"] != row["like"]]
+        own = self.rows[obj_id]
+        found = []
+        for other, row in self.rows.items():
+            is_of_kind = own["kind"] and row["kind"] == own["kind"]
+            if is_of_kind and row["like"] != own["like"]:
+                found.append(other)
+        return found
 
     def similar(self, obj_id: int, rng: Rng) -> int:
-        others = self._siblings(obj_id)
-        sides = [np.array(self.rows[k]["extents"]) for k in (obj_id, *others)]
-        first, *rest = (np.log(side / np.linalg.norm(side)) for side in sides)
-        gaps = [float(np.exp(np.abs(first - other).max())) for other in rest]
-        limit = max(MAX_PROPORTION, min(gaps))
-        return int(rng.choice([k for k, gap in zip(others, gaps, strict=True) if gap <= limit]))
+        own = self._proportions(obj_id)
+        gaps = {}
+        for other in self._siblings(obj_id):
+            gaps[other] = float(np.exp(np.abs(own - self._proportions(other)).max()))
+        limit = max(MAX_PROPORTION, min(gaps.values()))
+        return int(rng.choice([k for k, gap in gaps.items() if gap <= limit]))
+
+    def _proportions(self, obj_id: int) -> Array:
+        sides = np.array(self.rows[obj_id]["extents"])
+        return np.log(sides / np.linalg.norm(sides))
 
     def clutter(self, rng: Rng) -> TexturedMesh:
         return self._load(self.surroundings[rng.integers(len(self.surroundings))]["path"])
@@ -458,16 +466,18 @@ def _box(mask: Array) -> list[int]:
     for none."""
     if not mask.any():
         return [-1, -1, -1, -1]
-    rows = np.flatnonzero(mask.any(axis=1))
-    columns = np.flatnonzero(mask.any(axis=0))
-    return [int(x) for x in (columns[0], rows[0], columns[-1] - columns[0], rows[-1] - rows[0])]
+    y0, y1 = np.flatnonzero(mask.any(axis=1))[[0, -1]].tolist()
+    x0, x1 = np.flatnonzero(mask.any(axis=0))[[0, -1]].tolist()
+    return [x0, y0, x1 - x0, y1 - y0]
 
 
 def write_targets(options: Namespace) -> int:
     """List the instances that are visible enough in BOP's ``test_targets_bop19.json``; their
     number."""
     targets = []
-    for folder in sorted(p for p in (options.out / "test").iterdir() if p.name.isdecimal()):
+    for folder in sorted((options.out / "test").iterdir()):
+        if not folder.name.isdecimal():  # begun
+            continue
         truths = read_json(folder / "scene_gt.json")
         infos = read_json(folder / "scene_gt_info.json")
         for key in sorted(truths, key=int):
@@ -543,19 +553,14 @@ def main() -> None:
     models = options.out / "models"
     models.mkdir(exist_ok=True)
     ids = objects.written
-    with ProcessPoolExecutor(
-        options.jobs, get_context("spawn"), initializer=_start, initargs=(options,)
-    ) as pool:
-        rows = list(tqdm(pool.map(_model, ids, chunksize=4), total=len(ids), desc="models"))
-        write_json(models / "models_info.json", dict(zip(ids, rows, strict=True)))
-        list(tqdm(pool.map(_one, range(options.count)), total=options.count, desc="scenes"))
-    kept = {
-        name: str(value) if isinstance(value, Path) else value
-        for name, value in vars(options).items()
-        if name not in ("out", "jobs")
-    }
-    groups = {obj_id: objects.group(obj_id % TWIN) for obj_id in objects.written}
-    write_json(options.out / "benchmark.json", kept | {"groups": groups})
+    start = {"initializer": _start, "initargs": (options,)}
+    rows = in_processes(_model, ids, options.jobs, "models", **start)
+    write_json(models / "models_info.json", dict(zip(ids, rows, strict=True)))
+    list(in_processes(_one, range(options.count), options.jobs, "scenes", **start))
+    kept = {name: value for name, value in vars(options).items() if name not in ("out", "jobs")}
+    kept["meshes"] = options.meshes and str(options.meshes)
+    kept["groups"] = {obj_id: objects.group(obj_id % TWIN) for obj_id in ids}
+    write_json(options.out / "benchmark.json", kept)
     print(f"{write_targets(options)} targets in {options.count} scenes in {options.out}")
 
 

@@ -16,18 +16,15 @@ import re
 import subprocess
 import sys
 import zipfile
-from concurrent.futures import ProcessPoolExecutor
 from itertools import permutations
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
-from tqdm import tqdm
 
-from scripts._shared import parser_of, write_json
+from scripts._shared import in_processes, parser_of, write_json
 from scripts.scenes.textured import TexturedMesh
 
 PACKAGE = "sweethome3d-furniture"
@@ -98,15 +95,14 @@ def catalogue(unpacked: Path) -> list[dict]:
     rows = []
     for library in sorted(LICENCES):
         entries = {}
-        text = (unpacked / library / "PluginFurnitureCatalog.properties").read_text(
-            encoding="latin1"
-        )
+        path = unpacked / library / "PluginFurnitureCatalog.properties"
+        text = path.read_text(encoding="latin1")
         for name, number, value in re.findall(r"^(\w+)#(\d+)=(.*)$", text, re.MULTILINE):
-            entries.setdefault(int(number), {})[name] = (
-                value.encode("latin1").decode("unicode_escape").strip()
-            )
+            plain = value.encode("latin1").decode("unicode_escape").strip()
+            entries.setdefault(int(number), {})[name] = plain
         for _, entry in sorted(entries.items()):
             name = re.sub(r"\W+", "-", f"{library}-{Path(entry['model']).stem}").lower()
+            rotation = entry.get("modelRotation", "1 0 0 0 1 0 0 0 1").split()
             rows.append(
                 {
                     "id": name,
@@ -115,9 +111,7 @@ def catalogue(unpacked: Path) -> list[dict]:
                     "licence": entry.get("license") or LICENCES[library],
                     "creator": entry.get("creator", library),
                     "source": f"{library}{entry['model']}",
-                    "rotation": [
-                        float(x) for x in entry.get("modelRotation", "1 0 0 0 1 0 0 0 1").split()
-                    ],
+                    "rotation": list(map(float, rotation)),
                     "size": [float(entry[k]) / 100 for k in ("width", "depth", "height")],
                 }
             )
@@ -146,7 +140,8 @@ def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
     if (folder / "model.obj").exists():
         return None
     scale = max(row["size"]) / (high - low).max()
-    shift = np.array([*(-0.5 * (low + high)[:2]), -low[2]])
+    x, y, _ = -0.5 * (low + high)
+    shift = np.array([x, y, -low[2]])
     moved = iter((rotated + shift) * scale)
     written = []
     folder.mkdir(parents=True, exist_ok=True)
@@ -154,7 +149,8 @@ def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
         if line.startswith("v "):
             line = "v {:.6g} {:.6g} {:.6g}".format(*next(moved))
         elif line.startswith("vn "):
-            line = "vn {:.5g} {:.5g} {:.5g}".format(*(R @ np.array(line.split()[1:4], dtype=float)))
+            normal = R @ np.array(line.split()[1:4], dtype=float)
+            line = "vn {:.5g} {:.5g} {:.5g}".format(*normal)
         written.append(line)
     for other in source.parent.iterdir():
         if other.is_file() and other.suffix.lower() != ".obj":
@@ -170,14 +166,17 @@ def candidate_rotations() -> np.ndarray:
     """(32, 3, 3) possible symmetries: the 24 rotations of a cube, identity first, and steps of 30
     degrees about z."""
     x, y, z = np.meshgrid([1.0, -1.0], [1.0, -1.0], [1.0, -1.0])
-    signs = [np.diag(s) for s in np.stack([x, y, z], axis=-1).reshape(-1, 3)]
-    orders = [np.eye(3)[list(order)] for order in permutations(range(3))]
-    cube = [s @ o for o in orders for s in signs if np.linalg.det(s @ o) > 0]
+    signs = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    cube = []
+    for order in permutations(range(3)):
+        for sign in signs:
+            R = np.diag(sign) @ np.eye(3)[list(order)]
+            if np.linalg.det(R) > 0:
+                cube.append(R)
     cube.sort(key=lambda R: -np.trace(R))
-    about_z = Rotation.from_euler(
-        "z", [[30 * k] for k in range(1, 12) if k % 3], degrees=True
-    ).as_matrix()
-    return np.concatenate([cube, about_z])
+    steps = [30 * k for k in range(1, 12) if k % 3]
+    about_z = Rotation.from_euler("z", np.array(steps)[:, None], degrees=True)
+    return np.concatenate([cube, about_z.as_matrix()])
 
 
 def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -275,12 +274,10 @@ def main() -> None:
     unpacked = fetch(arguments.out, arguments.deb)
     once = {row["id"]: row for row in reversed(catalogue(unpacked))}  # removes duplicates
     tasks = [(row, unpacked, arguments.out) for name, row in sorted(once.items()) if is_used(name)]
-    with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
-        results = list(tqdm(pool.map(examine, tasks), total=len(tasks)))
     meshes = []
     left_out = {}
     clouds = {}
-    for row, why, cloud in results:
+    for row, why, cloud in in_processes(examine, tasks, arguments.jobs, "meshes"):
         if why is not None:
             left_out[row["id"]] = why
             continue

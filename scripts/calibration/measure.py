@@ -3,17 +3,14 @@ whether it is true: a row for each."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import groupby
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
@@ -25,7 +22,7 @@ from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
 from curvireg_torch.mesh import Mesh
 from curvireg_torch.registration import Follower, judging
 from curvireg_torch.registration.confidence import are_near
-from scripts._shared import read_json
+from scripts._shared import in_processes, read_json
 from scripts.calibration.sets import ESTIMATED, GREY, MODELS, SETS, UPRIGHT, photographs_of
 
 Row: TypeAlias = dict[str, Any]
@@ -266,10 +263,9 @@ def measured(
             entry = json.loads(line)
             known[json.dumps(entry["task"])] = entry["rows"]
     new = [(key, task) for key, task in tasks if json.dumps(key) not in known]
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, out.open("a") as file:
-        results = pool.map(measure_one, [task for _, task in new])
-        bar = tqdm(results, total=len(new), desc=name, unit="mesh")
-        for (key, _), rows in zip(new, bar, strict=True):
+    with out.open("a") as file:
+        results = in_processes(measure_one, [task for _, task in new], jobs, name)
+        for (key, _), rows in zip(new, results, strict=True):
             known[json.dumps(key)] = rows
             file.write(json.dumps({"task": key, "rows": rows}) + "\n")
             file.flush()

@@ -180,7 +180,7 @@ def test_axes_are_right_within_their_tolerance():
 
 
 def test_finished_tasks_are_kept(tmp_path, monkeypatch):
-    processes = "scripts.calibration.measure.ProcessPoolExecutor"
+    processes = "scripts._shared.ProcessPoolExecutor"
     monkeypatch.setattr(processes, lambda jobs, **_: ThreadPoolExecutor(jobs))
     out = tmp_path / "rows.jsonl"
     tasks = [([k, "a"], k) for k in (1, 2)]
