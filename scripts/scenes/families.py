@@ -347,7 +347,8 @@ def car(rng: Rng) -> Parts:
         glass = centre + (cabin - centre) * np.array([0.86, 0.75])
         parts.add(across(glass, width * 1.02), 1)
         wide = 0.66 * width
-        for a, b in ((cabin[0], cabin[1]), (cabin[3], cabin[2])):
+        front_low, front_high, back_high, back_low = cabin
+        for a, b in ((front_low, front_high), (back_low, back_high)):
             low_end = a + 0.15 * (b - a)
             high_end = a + 0.88 * (b - a)
             out = np.sign(low_end[0] - 0.5) * 0.004
@@ -361,8 +362,9 @@ def car(rng: Rng) -> Parts:
         floor = rng.uniform(0.5, 0.7) * belt * height
         _add_bed(parts, length, width, boot, (low, floor, tail * height))
     for s in (-1, 1):
-        at = (s * 0.35 * width, -0.5 * length, nose * height - 0.05)
-        lamp = box((0.2 * width, 0.02, 0.06)).moved(at)
+        x = s * 0.35 * width
+        lamp = box((0.2 * width, 0.02, 0.06))
+        lamp = lamp.moved((x, -0.5 * length, nose * height - 0.05))
         parts.add(lamp, 2)
         parts.add(lamp, 3, (0, length, (tail - nose) * height))
     _add_wheels(parts, rng, length, width, radius)

@@ -56,10 +56,14 @@ def random_light(rng: Rng) -> Light:
     for _ in range(int(rng.integers(1, 3))):
         towards = rng.normal(size=3) + up * rng.uniform(0, 2)
         power = rng.uniform(0.2, 1.0) * (1 + rng.normal(0, 0.08, 3))
-        lamps.append(Lamp(towards / np.linalg.norm(towards), power, bool(rng.random() < 0.6)))
+        shadows = bool(rng.random() < 0.6)
+        lamps.append(Lamp(towards / np.linalg.norm(towards), power, shadows))
     if rng.random() < 0.5:  # a lamp beside the camera
         lamps[0] = lamps[0]._replace(towards=np.zeros(3))
-    reflection = (float(rng.uniform(-0.2, 0.5)), random_colour(rng)) if rng.random() < 0.4 else None
+    reflection = None
+    if rng.random() < 0.4:
+        horizon = float(rng.uniform(-0.2, 0.5))
+        reflection = (horizon, random_colour(rng))
     return Light(up, sky, tint, tuple(lamps), reflection)
 
 
@@ -92,12 +96,14 @@ def shade_points(
             facing = facing * np.where(blocked, SHADOW, 1.0)
         half = view + lamp.towards
         half /= np.linalg.norm(half, axis=1, keepdims=True) + 1e-9
-        shine = gloss * np.maximum((normal * half).sum(axis=1), 0) ** shininess * (facing > 0)
+        highlight = np.maximum((normal * half).sum(axis=1), 0) ** shininess
+        shine = gloss * highlight * (facing > 0)
         radiance = radiance + (colour * facing[:, None] + shine[:, None]) * lamp.power
     if light.reflection is not None:
         horizon, above = light.reflection
         reflection = 2 * (normal * view).sum(axis=1, keepdims=True) * normal - view
-        bright = np.clip(0.5 + 2.0 * (reflection @ light.up - horizon), 0, 1)[:, None] * above
+        height = reflection @ light.up - horizon
+        bright = np.clip(0.5 + 2.0 * height, 0, 1)[:, None] * above
         weight = (0.6 * gloss)[:, None]
         radiance = (1 - weight) * radiance + weight * bright
     return np.maximum(radiance, 0)

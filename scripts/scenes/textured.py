@@ -51,13 +51,13 @@ class Texture:
             return np.broadcast_to(self.picture[0], points.shape)
         x = np.mod(uv[:, 0], 1.0) * w
         y = np.mod(1.0 - uv[:, 1], 1.0) * h
+        places = np.stack([x, y], 1)[:, None].astype(np.float32) + 0.5
         padded = np.pad(self.picture, ((1, 1), (1, 1), (0, 0)), mode="wrap")
-        # cv2.remap takes at most 32767 rows
-        size = 16384
         out = np.empty((len(uv), 3), np.float32)
+        size = 16384  # cv2.remap takes at most 32767 rows
         for k in range(0, len(uv), size):
-            xy = np.stack([x, y], 1)[k : k + size, None].astype(np.float32) + 0.5
-            out[k : k + size] = cv2.remap(padded, xy, None, cv2.INTER_LINEAR)[:, 0]
+            block = places[k : k + size]
+            out[k : k + size] = cv2.remap(padded, block, None, cv2.INTER_LINEAR)[:, 0]
         return out
 
 
@@ -262,13 +262,12 @@ def paint_of(part: trimesh.Trimesh) -> Texture:
 def linear_texture(image: Any) -> Array:
     """(h, w, 3) float32 linear colours of a Pillow picture; transparent parts are light grey."""
     rgba = np.asarray(image.convert("RGBA"), np.float32) / 255
-    rgb = (rgba[..., :3] * rgba[..., 3:] + 0.8 * (1 - rgba[..., 3:])) ** 2.2
+    alpha = rgba[..., 3:]
+    rgb = (rgba[..., :3] * alpha + 0.8 * (1 - alpha)) ** 2.2
     scale = MAX_TEXTURE / max(rgb.shape[:2])
-    return (
-        cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        if scale < 1
-        else rgb
-    )
+    if scale >= 1:
+        return rgb
+    return cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
 def barycentric(triangles: Array, points: Array) -> Array:
@@ -312,7 +311,9 @@ def render(
     H, W = size
     h = round(SUPERSAMPLING * H)
     w = round(SUPERSAMPLING * W)
-    zoom = np.array([[w / W, 0, 0.5 * (w / W - 1)], [0, h / H, 0.5 * (h / H - 1)], [0, 0, 1.0]])
+    x = w / W
+    y = h / H
+    zoom = np.array([[x, 0, 0.5 * (x - 1)], [0, y, 0.5 * (y - 1)], [0, 0, 1.0]])
     zoomed = zoom @ K
     pixels = np.mgrid[0:h, 0:w].reshape(2, -1)[::-1].T
     homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
