@@ -26,7 +26,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -101,9 +101,7 @@ def measure(step: str, folder: str, photographs: int) -> dict[str, float]:
 
     mesh = cr.load_mesh(Path(folder, "mesh.ply"))
     if step == "bank":
-        watch = Stopwatch()
-        cr.ViewBank.build(mesh, progress=False)
-        return watch.seconds(1)
+        return timed(lambda mesh: cr.ViewBank.build(mesh, progress=False), [mesh])
     K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
     paths = [str(Path(folder, f"photo{k}.png")) for k in range(EARLIER + photographs)]
     boxes = torch.tensor(_shared.read_json(Path(folder, "boxes.json")))
@@ -115,11 +113,7 @@ def measure(step: str, folder: str, photographs: int) -> dict[str, float]:
         first = read_image(paths[0])
         follower = Follower(registrar, K)
         assert follower(first, boxes[0]).ok
-        frames = [first.roll(2 * k, dims=-1) for k in range(1, FRAMES)]
-        watch = Stopwatch()
-        for frame in frames:
-            follower(frame)
-        return watch.seconds(len(frames))
+        return timed(follower, [first.roll(2 * k, dims=-1) for k in range(1, FRAMES)])
 
     def register(index: Sequence[int]) -> None:
         results = registrar([paths[k] for k in index], boxes[list(index)], K)
@@ -131,31 +125,28 @@ def measure(step: str, folder: str, photographs: int) -> dict[str, float]:
         register(earlier)
         return {"seconds": 0.0}
     if step == "fresh":
-        calls = [[k] for k in earlier]
-    else:
-        register(earlier[:1])  # loads what every later photograph shares
-        calls = [list(new)] if step == "many" else [[k] for k in new[:NEW]]
+        return timed(register, [[k] for k in earlier])
+    register(earlier[:1])  # loads what every later photograph shares
+    if step == "many":
+        together = timed(register, [new])
+        return {name: value / photographs for name, value in together.items()}
+    calls = [[k] for k in new[:NEW]]
     if step == "repeated":
-        for call in calls:
-            register(call)
-    watch = Stopwatch()
-    for call in calls:
-        register(call)
-    return watch.seconds(sum(map(len, calls)))
+        timed(register, calls)
+    return timed(register, calls)
 
 
-class Stopwatch:
-    """Wall and processor time since it was made."""
-
-    def __init__(self) -> None:
-        self.wall = time.perf_counter()
-        self.processor = time.process_time()
-
-    def seconds(self, count: int) -> dict[str, float]:
-        """Of one of ``count`` equal parts."""
-        wall = (time.perf_counter() - self.wall) / count
-        processor = (time.process_time() - self.processor) / count
-        return {"seconds": wall, "processor_seconds": processor}
+def timed(function: Callable[[Any], object], values: Sequence[Any]) -> dict[str, float]:
+    """Wall and processor seconds of a call, for each of the values."""
+    wall = time.perf_counter()
+    processor = time.process_time()
+    for value in values:
+        function(value)
+    count = len(values)
+    return {
+        "seconds": (time.perf_counter() - wall) / count,
+        "processor_seconds": (time.process_time() - processor) / count,
+    }
 
 
 def measured(
