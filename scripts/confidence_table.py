@@ -30,24 +30,8 @@ from scripts._shared import (
 
 RIGHT = 30.0  # degrees
 ERROR_COLUMNS = ("rotation", "symmetric_error_deg")  # of BOP sets and of PASCAL3D+
-# by the name of their set in scripts/calibration
-GENERATED = {
-    "shelves": "on full shelves, half of them grey",
-    "shapes": "alone, shapes",
-    "furniture": "alone, furniture",
-    "packages": "alone, packages",
-    "tied": "several poses look alike",
-    "cut": "cut by the border by 10 to 60 %, shapes",
-    "cut_packages": "the same, packages",
-    "estimated_shapes": "camera withheld, shapes",
-    "estimated_packages": "camera withheld, packages",
-    "print": "another print",
-    "wrong": "another mesh",
-    "estimated_wrong": "another mesh, camera withheld",
-    "mirrored": "mirror image of the mesh, nearly symmetric shapes",
-    "grey": "all grey ones",
-    "with colours": "all with colours",
-}
+GENERATED = read_json(Path(__file__).with_name("tables.json"))["generated"]
+"""By the name of their set in scripts/calibration: what photographs show."""
 
 
 def main() -> None:

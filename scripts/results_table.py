@@ -10,7 +10,9 @@ A stored summary contains the date and the commit at which it was recorded ("+":
 changes), so record it right after measuring.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -26,46 +28,18 @@ from scripts._shared import (
     write_json,
 )
 
-PASCAL3D = (
-    "set | N | Acc 30° | Acc 10° | median | Acc 30°, symmetric | easy: Acc 30° | median",
-    "Acc 30°, Acc 10°: share of the objects whose rotation error acos((tr(R1ᵀR2) - 1) / 2) is "
-    "below; median: of that "
-    "error; symmetric: a bottle's turns about its axis and a table's half turn do not count; "
-    "easy: neither truncated, "
-    "occluded nor difficult. No camera is given.",
-)
-BOP = (
-    "set | N | Acc 15° | Acc 30° | median | ADD(-S) 0.1d | AR MSSD | AR MSPD | unoccluded: N | "
-    "Acc 30°",
-    "Rotation errors up to the object's symmetries; ADD(-S) 0.1d: share of the objects whose mean "
-    "distance of model "
-    "points is below a tenth of the diameter; AR MSSD, AR MSPD: BOP's average recalls; "
-    "unoccluded: at least 95 % "
-    "visible. Box and camera matrix are given.",
-)
+SHOWN = read_json(Path(__file__).with_name("tables.json"))
+KINDS = SHOWN["kinds"]
+"""Of each kind of data set: title, definition and columns of its table, with the keys of scores;
+and the scores that a comparison shows."""
 
-
-WORDS = {
-    "hope_print": "Printed packages in clutter, with their print",
-    "hope": "The same packages, of a mesh without print",
-    "hope28": "27 household packages in clutter, of meshes without print",
-    "ycbv_mini": "Household objects in clutter (YCB-Video)",
-    "buddha": "A plaster figurine",
-    "dino": "A toy dinosaur",
-    "visp_boxes": "Boxes and cubes, of meshes without their print",
-    "lego": "A LEGO model",
-    "tless_tiago": "Industrial parts without texture (T-LESS)",
-    "tracebot": "Transparent canisters and a tray",
-    "lm": "Two figurines among clutter (LINEMOD)",
-    "lmo": "Small objects behind others (LINEMOD-Occlusion)",
-    "pascal3d_mini": "Cars, chairs and others on photographs of the web, with the mesh of a "
-    "similar object and without a camera (PASCAL3D+)",
-}
+WORDS = SHOWN["words"]
 """What a set shows, in the order of the README's table."""
 
-RIGHT = 30.0  # degrees
+LIGHTINGS = SHOWN["lightings"]
+"""Of sets with several lightings of a view: their number; objects are not independent."""
 
-LIGHTINGS = {"hope": 5, "hope_print": 5}  # per view; objects of these sets are not independent
+RIGHT = 30.0  # degrees
 
 
 def main() -> None:
@@ -98,13 +72,6 @@ def record(summary: Path, name: str) -> Path:
     return path
 
 
-COMPARED = {
-    "pascal3d": ("acc_pi_6", "acc_pi_18", "med_err_deg"),
-    "bop": ("acc_15_deg", "acc_30_deg", "med_err_deg", "mspd_ar"),
-}
-"""Of each kind of data set: the scores that a comparison shows."""
-
-
 def comparison(summaries: Sequence[Path], results: Path) -> str:
     """Markdown of ``DIR/NAME/summary.json`` files beside the stored results of the same names."""
     rows = [["set", "N", "score", "stored", "now"]]
@@ -112,14 +79,16 @@ def comparison(summaries: Sequence[Path], results: Path) -> str:
         name = path.parent.name
         measured = read_json(path)
         earlier = stored(results / f"evaluation_{name}.json").get("summary", {})
-        for key in COMPARED[measured["settings"]["dataset"]]:
+        for key in KINDS[measured["settings"]["dataset"]]["compared"]:
             values = [score(summary.get(key), key) for summary in (earlier, measured)]
             rows.append([name, measured["n"], key, *values])
     return markdown_table(rows)
 
 
 def score(value: float | None, key: str) -> str:
-    """A score as the tables print it."""
+    """A number of a summary as the tables print it."""
+    if key == "n":
+        return str(value)
     return degrees(value) if key.endswith("_err_deg") else percent(value)
 
 
@@ -178,22 +147,27 @@ def table(results: Path) -> str:
     """Markdown of all stored summaries."""
     records = stored_records(results)
     parts = []
-    for title, kind, (columns, definition), cells in (
-        ("Viewpoints on PASCAL3D+", "pascal3d", PASCAL3D, pascal3d_cells),
-        ("Poses on BOP sets", "bop", BOP, bop_cells),
-    ):
-        chosen = [r for r in records if r["summary"]["settings"]["dataset"] == kind]
+    for name, kind in KINDS.items():
+        chosen = [each for each in records if each["summary"]["settings"]["dataset"] == name]
         if not chosen:
             continue
-        rows = [columns.split(" | ")]
+        rows = [["set", *(column for column, _ in kind["columns"])]]
         sets = {}
         for each in chosen:
-            rows.append(cells(each["name"], each["summary"]))
+            rows.append([each["name"], *cells(each, kind["columns"])])
             sets.setdefault(note(each), []).append(each["name"])
         notes = [f"- {', '.join(names)}: {conditions}" for conditions, names in sets.items()]
-        lines = [f"**{title}.** {definition}", "", markdown_table(rows), *notes, ""]
-        parts.append("\n".join(lines))
+        title = f"**{kind['title']}.** {kind['definition']}"
+        parts.append("\n".join([title, "", markdown_table(rows), *notes, ""]))
     return "\n".join(parts)
+
+
+def cells(record: dict[str, Any], columns: Sequence[Sequence[str]]) -> Iterator[str]:
+    """The scores of a set; keys within others are parted by slashes."""
+    for _, keys in columns:
+        *outer, key = keys.split("/")
+        value = reduce(getitem, outer, record["summary"])[key]
+        yield counted(record["name"], value) if keys == "n" else score(value, key)
 
 
 def note(record: dict[str, Any]) -> str:
@@ -207,36 +181,6 @@ def note(record: dict[str, Any]) -> str:
         f"preset {settings['preset']}; {summary['failed']} failed, {skipped} skipped; "
         f"{record['date']}, commit {record['commit']}"
     )
-
-
-def pascal3d_cells(name: str, summary: dict[str, Any]) -> list[object]:
-    easy = summary["subsets"]["easy"]
-    return [
-        name,
-        summary["n"],
-        percent(summary["acc_pi_6"]),
-        percent(summary["acc_pi_18"]),
-        degrees(summary["med_err_deg"]),
-        percent(summary["symmetry_aware"]["acc_pi_6"]),
-        percent(easy["acc_pi_6"]),
-        degrees(easy["med_err_deg"]),
-    ]
-
-
-def bop_cells(name: str, summary: dict[str, Any]) -> list[object]:
-    whole = summary["subsets"]["unoccluded"]
-    return [
-        name,
-        counted(name, summary["n"]),
-        percent(summary["acc_15_deg"]),
-        percent(summary["acc_30_deg"]),
-        degrees(summary["med_err_deg"]),
-        percent(summary["add_recall_0.1d"]),
-        percent(summary["mssd_ar"]),
-        percent(summary["mspd_ar"]),
-        whole["n"],
-        percent(whole["acc_30_deg"]),
-    ]
 
 
 def counted(name: str, n: int) -> str:

@@ -24,7 +24,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from scripts._shared import in_processes, parser_of, write_json
+from scripts._shared import in_processes, parser_of, read_json, write_json
 from scripts.scenes.textured import TexturedMesh
 
 PACKAGE = "sweethome3d-furniture"
@@ -39,30 +39,10 @@ LICENCES = {
     "Scopia": "CC-BY-3.0",
 }
 
-KINDS = {
-    "chair": r"((oak|osaka|ryokan|cafe|folding|plastic|teck|child|children) )?chair|chair with cushion|class seat",  # noqa: E501
-    "armchair": r"(modern |rattan |winchester )?armchair",
-    "sofa": r"(burlap |clear |rattan |winchester )?(sofa|couch)( [23] seats)?|futon couch|convertible sofa bz",  # noqa: E501
-    "bed": r"(child |iron |hospital |captain's |baby )?bed",
-    "bench": r"(painted )?bench|wood bank",
-    "bookcase": r"(full )?bookcase|shelves|vertical shelves",
-    "cabinet": r"wardrobe|cupboard|dresser.*|drawers cabinet|(small )?lower cabinet|high cabinet|filing cabinet"  # noqa: E501
-    r"|bedside table|sink cabinet|glass door cabinet",
-    "cooker": r"(double |small )?oven|(large )?stove|cooker|microwave|(clothes )?washing machine|dryer machine"  # noqa: E501
-    r"|(large )?fridge|refrigerator",
-    "washbasin": r"washbasin|vanity",
-    "toilet": r"toilets unit",
-    "car": r"chevrolet|concept sedan.*|ford focus|peugeot.*|renault.*|suv|seat leon|smart car|vw new beetle|van"  # noqa: E501
-    r"|car model",
-    "bus": r"(city )?bus",
-    "bicycle": r"bicycle|bike",
-    "standing person": r"female|male|boy|girl|mannequin.*|holding.*",
-    "screen": r"tv( 16:9)?|wall flat tv|apple imac.*",
-    "laptop": r"laptop|apple ibook",
-}
-"""Objects of one kind share the direction of the front and the general build, as checked by eye.
-Groups for which this does not hold (animals, cups, desks, motorcycles, bathtubs, pianos, shoes,
-sitting people) have no kind."""
+KINDS = read_json(Path(__file__).with_name("kinds.json"))
+"""By a pattern of their names, objects of one kind: they share the direction of the front and the
+general build, as checked by eye. Groups for which this does not hold (animals, cups, desks,
+motorcycles, bathtubs, pianos, shoes, sitting people) have no kind."""
 
 UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """Rotation from the catalogue's frame (y up, front +z) to ours (z up, front -y)."""

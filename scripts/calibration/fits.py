@@ -16,7 +16,7 @@ from curvireg_torch.registration.confidence import (
     LogisticModel,
 )
 from scripts.calibration.measure import RIGHT, Row
-from scripts.calibration.sets import ABSENT, SHARES
+from scripts.calibration.sets import SETS
 
 FOLDS = 5
 RESOLUTIONS = np.arange(0.5, 1.55, 0.1).round(2).tolist()
@@ -162,10 +162,10 @@ def errors_within(errors: np.ndarray) -> Row:
 
 
 def weights_of(sets: np.ndarray) -> np.ndarray:
-    """(n,) weights of rows by their sets, with which sets of ``SHARES`` have these shares of all
+    """(n,) weights of rows by their sets, with which these have their assumed shares of all
     photographs."""
     weight = np.ones(len(sets))
-    assumed = {name: SHARES[name] for name in np.unique(sets) if name in SHARES}
+    assumed = {name: SETS[name].share for name in np.unique(sets) if SETS[name].share}
     ordinary = float((~np.isin(sets, list(assumed))).sum())
     factor = ordinary / (1.0 - sum(assumed.values()))
     for name, share in assumed.items():
@@ -177,7 +177,7 @@ def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
     """Constants of a model of registrations, and their quality on held-out folds, in all and by
     set."""
     for row in rows:
-        is_present = row["set"] not in ABSENT
+        is_present = not SETS[row["set"]].absent
         row["right"] = is_present and min(row["errors"]) < RIGHT
         row["first"] = is_present and row["errors"][0] < RIGHT
     sets = np.array([row["set"] for row in rows])

@@ -23,7 +23,7 @@ from curvireg_torch.mesh import Mesh
 from curvireg_torch.registration import Follower, judging
 from curvireg_torch.registration.confidence import are_near
 from scripts._shared import in_processes, read_json
-from scripts.calibration.sets import ESTIMATED, GREY, MODELS, SETS, UPRIGHT, photographs_of
+from scripts.calibration.sets import photographs_of, set_of
 
 Row: TypeAlias = dict[str, Any]
 Task = TypeVar("Task")
@@ -181,7 +181,8 @@ def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
 
 def is_grey(kind: str, obj_id: int) -> bool:
     """Whether a mesh of a set loses its colours."""
-    return kind in GREY and obj_id % GREY[kind] == 0
+    every = set_of(kind).grey
+    return every is not None and obj_id % every == 0
 
 
 def mesh_of(path: Path, *, grey: bool) -> Mesh:
@@ -203,7 +204,8 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
         pipeline=cr.Pipeline().with_pose_prior(pose),
         mesh_is="similar" if "similar" in kind else "exact",
     )
-    with_camera = kind not in (*MODELS["category"], *ESTIMATED)
+    own = set_of(kind)
+    with_camera = own.photographs is None and own.model == "instance"
     groups = read_json(folder / "benchmark.json")["groups"]
     same = {
         "group": f"{kind} {groups[str(obj_id)]}",
@@ -228,8 +230,7 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
 def rows_of(work: Path, kind: str, jobs: int) -> list[Row]:
     """Rows of a set, or of refinements and detections in the set "shapes"; finished meshes are read
     from the file."""
-    photographs = photographs_of(kind)
-    folder = work / (photographs if photographs in SETS else "shapes")
+    folder = work / photographs_of(kind)
     out = work / f"{kind}.jsonl"
     data = BOPDataset(folder)
     annotations = [data.annotation(i) for i in range(len(data))]
@@ -237,7 +238,7 @@ def rows_of(work: Path, kind: str, jobs: int) -> list[Row]:
 
     def mesh_and_pose(entry: tuple[int, int, int]) -> tuple[int, int]:
         # of these, make.py alternates upright and any pose
-        upright = kind in UPRIGHT and entry[0] % 2 == 0
+        upright = set_of(kind).upright and entry[0] % 2 == 0
         return entry[1], int(not upright)
 
     tasks = []

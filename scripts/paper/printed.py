@@ -12,21 +12,9 @@ from statistics import fmean
 
 from scripts._shared import read_json
 
-DETECTORS = (
-    "MFC",
-    "MCS",
-    "PCI",
-    "MINEIG",
-    "HARRIS",
-    "SIFT",
-    "SURF",
-    "SOBEL",
-    "CANNY",
-    "LOG",
-    "FUZZY",
-)
 PAIRS = tuple(f"{depth}/{photo}" for depth in ("CS", "ASG", "AR") for photo in ("MFC", "MCS", "IG"))
 TABLES = read_json(Path(__file__).with_suffix(".json"))
+DETECTORS = TABLES["detectors"]
 
 
 def _named(row: Sequence[float], names: Sequence[str], unit: float = 1.0) -> dict[str, float]:
