@@ -63,7 +63,11 @@ def write_json(path: Path, content: Any, indent: int = 2) -> None:
 
 
 def in_processes(
-    function: Callable[[Any], Any], tasks: Sequence[Any], jobs: int, name: str, **options: Any
+    function: Callable[[Any], Any],
+    tasks: Sequence[Any],
+    jobs: int,
+    name: str,
+    **options: Any,
 ) -> Iterator[Any]:
     """Results of tasks in their order, with a bar; ``options`` are those of the processes."""
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), **options) as pool:

@@ -318,7 +318,10 @@ Annotated = dict[int, tuple[int, TexturedMesh]]
 
 
 def compose(
-    objects: Packages, options: Namespace, index: int, attempt: int
+    objects: Packages,
+    options: Namespace,
+    index: int,
+    attempt: int,
 ) -> tuple[Scene, Annotated]:
     """Scene ``index``, a different one at each ``attempt``."""
     rng = np.random.default_rng((options.seed, index, attempt))
@@ -349,7 +352,11 @@ def full_shelf(objects: Packages, options: Namespace, rng: Rng) -> tuple[Scene, 
 
 
 def lone_object(
-    objects: Packages, options: Namespace, index: int, attempt: int, rng: Rng
+    objects: Packages,
+    options: Namespace,
+    index: int,
+    attempt: int,
+    rng: Rng,
 ) -> tuple[Scene, Annotated]:
     """Objects take turns, in a random order."""
     order = np.random.default_rng((options.seed, 1)).permutation(len(objects.ids))

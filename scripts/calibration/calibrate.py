@@ -32,7 +32,12 @@ LEVELS = (0.5, 0.9)  # of ellipsoids whose coverage is measured
 CONSTANTS = REPOSITORY / "curvireg_torch" / "calibration" / "calibration.json"
 
 
-def calibrate(work: Path, jobs: int, models: Sequence[str], meshes: Path | None) -> tuple[Row, Row]:
+def calibrate(
+    work: Path,
+    jobs: int,
+    models: Sequence[str],
+    meshes: Path | None,
+) -> tuple[Row, Row]:
     """Constants, those of other ``models`` as they were, and quality of the new ones on held-out
     kinds of objects."""
     constants: Row = read_json(CONSTANTS)

@@ -48,17 +48,10 @@ from scripts.calibration.measure import (
     symmetries_of,
     true_centre,
 )
+from scripts.calibration.sets import SETS
 
-ALONE = ("ordinary", "camera", "cropped", "sizes")
-SOURCES: dict[str, tuple[str, ...]] = {
-    "shapes": ALONE,
-    "packages": ALONE,
-    "furniture": ALONE,
-    "variant": ("variant", "chosen"),
-    "wrong": ("stranger",),
-    "tied": ("twins", "round"),
-}
-"""Of each set of calibrate.py: the kinds that it serves."""
+SOURCES = {name: each.misleads for name, each in SETS.items() if each.misleads}
+"""Of each set: the kinds that it serves."""
 
 WAYS = {"camera": 7, "sizes": 2, "chosen": 2}
 """Kinds for which a photograph is taken in several ways."""
@@ -152,7 +145,11 @@ def cropped(image: Tensor, box: Tensor) -> Case:
 
 
 def answer_of(
-    result: cr.Registration, registrar: cr.Registrar, sample: Row, K: Tensor | None, right_mesh: int
+    result: cr.Registration,
+    registrar: cr.Registrar,
+    sample: Row,
+    K: Tensor | None,
+    right_mesh: int,
 ) -> Row:
     """What a result says, and how wrong it is."""
     R = torch.stack([h.rotation.double() for h in result.hypotheses])
@@ -210,7 +207,10 @@ def measure(task: tuple[Path, list[str], list[int]]) -> list[Row]:
 
 
 def registrars_of(
-    kind: str, alone: cr.Registrar, folder: Path, sample: Row
+    kind: str,
+    alone: cr.Registrar,
+    folder: Path,
+    sample: Row,
 ) -> list[tuple[cr.Registrar, int]]:
     """The registrar of the mesh ``alone``, or two of the mesh and another one, in both orders; and
     which mesh the photograph shows."""

@@ -24,6 +24,7 @@ class PhotoSet(NamedTuple):
         grey: every n-th mesh loses its colours.
         upright: half of the objects stand upright.
         absent: the photographs do not show the mesh: no pose is right.
+        misleads: kinds of misleading.py that it serves.
     """
 
     scenes: float = 0.0
@@ -34,6 +35,7 @@ class PhotoSet(NamedTuple):
     grey: int | None = None
     upright: bool = False
     absent: bool = False
+    misleads: Sequence[str] = ()
 
 
 LISTED = read_json(Path(__file__).with_suffix(".json"))
@@ -71,7 +73,11 @@ def sets_of(models: Sequence[str], meshes: Path | None) -> list[str]:
 
 
 def render_sets(
-    work: Path, meshes: Path | None, count: int, jobs: int, models: Sequence[str]
+    work: Path,
+    meshes: Path | None,
+    count: int,
+    jobs: int,
+    models: Sequence[str],
 ) -> None:
     """Render the sets of ``models`` that ``work`` lacks; finished scenes are kept."""
     for name in dict.fromkeys(map(photographs_of, sets_of(models, meshes))):

@@ -106,7 +106,10 @@ def measure_points(cases: list[Case], settings: BankSettings, _pose: str) -> lis
 
 
 def _points_of(
-    case: Case, mesh: Mesh, describers: dict[str, ViewDescriber], settings: BankSettings
+    case: Case,
+    mesh: Mesh,
+    describers: dict[str, ViewDescriber],
+    settings: BankSettings,
 ) -> Record:
     crop = rgb_to_grayscale(case.crop(settings))
     R, distance = case.view(mesh)
@@ -236,7 +239,13 @@ class Truth:
         return 100.0 * abs(float(torch.linalg.vector_norm(R @ centre + t) / true) - 1.0)
 
 
-def _ranked(matcher: ViewMatcher, crop: Tensor, truth: Truth, *, wider: bool) -> Record:
+def _ranked(
+    matcher: ViewMatcher,
+    crop: Tensor,
+    truth: Truth,
+    *,
+    wider: bool,
+) -> Record:
     """``wider``: with what the search finds between views down the ranking until two are
     coherent."""
     rotations = matcher.bank.rotations
@@ -283,7 +292,12 @@ def measure_focus(cases: list[Case], settings: BankSettings, pose: str) -> list[
     return [_focus_of(case, mesh, matcher, azimuths) for case in cases]
 
 
-def _focus_of(case: Case, mesh: Mesh, matcher: ViewMatcher, azimuths: Tensor) -> Record:
+def _focus_of(
+    case: Case,
+    mesh: Mesh,
+    matcher: ViewMatcher,
+    azimuths: Tensor,
+) -> Record:
     rotations = matcher.bank.rotations.double()
     settings = matcher.bank.settings
     crop = case.crop(settings)

@@ -87,7 +87,10 @@ def measure_groups(
 
 
 def measure(
-    cases: list[Case], phase: str, settings: BankSettings, pose: str
+    cases: list[Case],
+    phase: str,
+    settings: BankSettings,
+    pose: str,
 ) -> list[dict[str, Any]]:
     """Records of the cases of one mesh."""
     from scripts.paper.measure import MEASURES
@@ -124,7 +127,10 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def collect(
-    phase: str, cases: list[Case], settings: BankSettings, arguments: argparse.Namespace
+    phase: str,
+    cases: list[Case],
+    settings: BankSettings,
+    arguments: argparse.Namespace,
 ) -> list[dict[str, Any]]:
     """The records of all cases; those of each mesh are stored when they are known."""
     state = (phase, settings, DATASETS[arguments.kind].pose)
@@ -145,7 +151,12 @@ def collect(
     return [record for path in groups for record in read_json(path)]
 
 
-def request_of(group: list[Case], phase: str, settings: BankSettings, pose: str) -> str:
+def request_of(
+    group: list[Case],
+    phase: str,
+    settings: BankSettings,
+    pose: str,
+) -> str:
     """Digest of all that the records of a mesh depend on."""
     own = [
         Path(__file__).with_name(name).read_text(encoding="utf-8")

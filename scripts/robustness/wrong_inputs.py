@@ -31,7 +31,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from scripts._shared import RESULTS, parser_of, stamp, write_json
+from scripts._shared import RESULTS, parser_of, read_json, stamp, write_json
 
 # processor seconds and memory that a command may take
 SECONDS = 20.0
@@ -40,14 +40,12 @@ MEGABYTES = 4000
 GOOD = Path(__file__).with_name("good")
 """A folder of good cameras, lists and poses."""
 
-COMMANDS = {
-    "rig.csv": "register --views {} truck.ply",
-    "images.txt": "register --views {} truck.ply",
-    "scene/scene_camera.json": "register --views {folder} truck.ply",
-    "photos.csv": "register --list {} truck.ply",
-    "start.json": "register photo.png truck.ply --camera camera.json --start {}",
-}
+LISTED = read_json(Path(__file__).with_name("commands.json"))
+COMMANDS = LISTED["commands"]
 """The commands that read the good files which are no calibrations."""
+
+DAMAGED = LISTED["damaged"]
+"""Files that are damaged, and the command that reads them."""
 
 
 def cases(folder: Path) -> list[tuple[str, str]]:
@@ -186,23 +184,6 @@ def damage(data: bytes, rng: np.random.Generator) -> bytes:
         else:
             out[at : at + 1] = rng.choice([b"\x00", b"\xff", b"-", b"9", b"nan", b"1e999", b"\n"])
     return bytes(out)
-
-
-OF_PHOTO = "register {} --out out truck.ply --box 30 25 210 160"
-OF_MESH = "register photo.png {} --out out --box 30 25 210 160"
-DAMAGED = {
-    "photo.png": OF_PHOTO,
-    "photo.jpg": OF_PHOTO,
-    "truck.ply": OF_MESH,
-    "truck.obj": OF_MESH,
-    "truck.stl": OF_MESH,
-    "truck.off": OF_MESH,
-    "truck.glb": OF_MESH,
-    "truck.safetensors": OF_MESH,
-    "camera.json": "register photo.png truck.ply --box 30 25 210 160 --camera {} --out out",
-    "photos.csv": "register --list {} --out out truck.ply",
-}
-"""Files that are damaged, and the command that reads them."""
 
 
 def main() -> int:

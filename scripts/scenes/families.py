@@ -273,7 +273,13 @@ def screen(rng: Rng) -> Parts:
     return parts
 
 
-def _add_wheels(parts: Parts, rng: Rng, length: float, width: float, radius: float) -> None:
+def _add_wheels(
+    parts: Parts,
+    rng: Rng,
+    length: float,
+    width: float,
+    radius: float,
+) -> None:
     across = rotation(1, np.pi / 2)
     heights = np.array([0.0, -0.35, -0.5, -0.3, 0.3, 0.5]) * radius * 0.5
     tyre = lathe(radius * np.array([0.55, 0.6, 0.95, 1, 1, 0.95]), heights)
@@ -372,7 +378,11 @@ def car(rng: Rng) -> Parts:
 
 
 def _add_bed(
-    parts: Parts, length: float, width: float, start: float, heights: tuple[float, float, float]
+    parts: Parts,
+    length: float,
+    width: float,
+    start: float,
+    heights: tuple[float, float, float],
 ) -> None:
     """Open bed from the fraction ``start`` of the length; ``heights`` of its underside, floor and
     rim."""

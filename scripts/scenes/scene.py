@@ -87,7 +87,13 @@ def single(
     return _lit(shapes, view, target.hull, cameras, rng)
 
 
-def _lit(shapes: list[Placed], view: View, points: Array, cameras: int, rng: Rng) -> Scene:
+def _lit(
+    shapes: list[Placed],
+    view: View,
+    points: Array,
+    cameras: int,
+    rng: Rng,
+) -> Scene:
     """The scene of shapes under a random light, seen by a rig that looks at points (P, 3)."""
     light = random_light(rng)
     background = random_picture(rng, 512)
@@ -149,7 +155,14 @@ def shelf(
     return _lit(shapes, view, points, cameras, rng)
 
 
-def look_at(points: Array, rng: Rng, *, fill: float, azimuth: float, elevation: float) -> View:
+def look_at(
+    points: Array,
+    rng: Rng,
+    *,
+    fill: float,
+    azimuth: float,
+    elevation: float,
+) -> View:
     """A view whose box around points (P, 3) is ``fill`` px long and lies near the middle; angles in
     degrees."""
     H, W = SIZE
@@ -177,7 +190,12 @@ def look_at(points: Array, rng: Rng, *, fill: float, azimuth: float, elevation: 
     return R, distance * ray - R @ middle, K
 
 
-def cut(view: View, points: Array, fraction: float, rng: Rng) -> View:
+def cut(
+    view: View,
+    points: Array,
+    fraction: float,
+    rng: Rng,
+) -> View:
     """The view, turned so that about ``fraction`` of the outline of points (P, 3) lies outside the
     picture, at one side or at two."""
     R, t, K = view
@@ -213,7 +231,12 @@ def _turn_to(ray: Array, target: Array) -> Array:
     return second @ first.T
 
 
-def _rig(view: View, points: Array, cameras: int, rng: Rng) -> list[View]:
+def _rig(
+    view: View,
+    points: Array,
+    cameras: int,
+    rng: Rng,
+) -> list[View]:
     """The view and others around it, which look at the middle of points (P, 3) from other
     azimuths."""
     R, t, K = view
@@ -230,7 +253,12 @@ def _rig(view: View, points: Array, cameras: int, rng: Rng) -> list[View]:
     return views
 
 
-def camera_path(view: View, middle: Array, count: int, rng: Rng) -> list[View]:
+def camera_path(
+    view: View,
+    middle: Array,
+    count: int,
+    rng: Rng,
+) -> list[View]:
     """Smooth random path of ``count`` views around ``middle`` (3,); steps are at most MAX_TURN and
     MAX_SHIFT."""
     R, t, K = view
@@ -300,7 +328,12 @@ def _room(textures: Callable[[Rng], Array], toward: Array, rng: Rng) -> list[Pla
 
 
 def _clutter(
-    draw: Draw, reach: float, eye: Array, count: int, occluder: bool, rng: Rng
+    draw: Draw,
+    reach: float,
+    eye: Array,
+    count: int,
+    occluder: bool,
+    rng: Rng,
 ) -> list[Placed]:
     """Other meshes on the floor; the last one, an occluder, stands between the object and the
     camera."""

@@ -151,7 +151,13 @@ def torus(radius: float, thickness: float) -> Surface:
     return grid(np.concatenate([flat, height], -1), caps=False)
 
 
-def bar(start: ArrayLike, end: ArrayLike, radius: float, *, sides: int = 10) -> Surface:
+def bar(
+    start: ArrayLike,
+    end: ArrayLike,
+    radius: float,
+    *,
+    sides: int = 10,
+) -> Surface:
     """Straight rod between two points; ``sides=4`` makes it square."""
     a = np.asarray(start, dtype=float)
     b = np.asarray(end, dtype=float)

@@ -89,7 +89,13 @@ class TexturedMesh:
 
     @classmethod
     def from_arrays(
-        cls, vertices: Array, faces: Array, paints: Any, *, uv: Any = None, paint: Any = None
+        cls,
+        vertices: Array,
+        faces: Array,
+        paints: Any,
+        *,
+        uv: Any = None,
+        paint: Any = None,
     ) -> Any:
         """A mesh with flat shading; ``uv`` (V, 2) and ``paint`` (F,) may be left out."""
         corners = np.asarray(vertices, float)[faces]
@@ -354,7 +360,11 @@ def render(
 
 
 def seen_surface(
-    shapes: list[Placed], R: Array, corners: list[Array], numbers: Array, points: Array
+    shapes: list[Placed],
+    R: Array,
+    corners: list[Array],
+    numbers: Array,
+    points: Array,
 ) -> tuple[Array, ...]:
     """What rays see at points (N, 3) of triangles with numbers (N,): the number of the shape,
     normal (N, 3) towards the camera, colour (N, 3), gloss and shininess.

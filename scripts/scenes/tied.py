@@ -110,7 +110,12 @@ def handed(rng: Rng) -> Surface:
     return join([plate, arm, pin])
 
 
-def _body(width: float, depth: float, height: float, radius: float | None) -> Surface:
+def _body(
+    width: float,
+    depth: float,
+    height: float,
+    radius: float | None,
+) -> Surface:
     """A cylinder if there is a radius, else a box; it stands on z = 0."""
     if radius is not None:
         return disc(radius, 0.0, height)

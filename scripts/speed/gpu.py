@@ -58,7 +58,11 @@ def rotations(results: Any) -> list[Tensor | None]:
 
 
 def measure(
-    count: int, device: str, *, few_views: bool, record: Callable[[str, Any], None]
+    count: int,
+    device: str,
+    *,
+    few_views: bool,
+    record: Callable[[str, Any], None],
 ) -> None:
     views = cr.sample_views(azimuth_step=60, elevations=[0, 30]) if few_views else None
     sphere = dented_sphere(2 if few_views else 6)

@@ -150,7 +150,11 @@ def timed(function: Callable[[Any], object], values: Sequence[Any]) -> dict[str,
 
 
 def measured(
-    step: str, checkout: Path, folder: Path, cache: Path, photographs: int
+    step: str,
+    checkout: Path,
+    folder: Path,
+    cache: Path,
+    photographs: int,
 ) -> dict[str, float]:
     """Seconds, processor seconds and MB of a step in a checkout."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "CURVIREG_CACHE": str(cache)}
@@ -172,7 +176,10 @@ def measured(
 
 
 def compare(
-    checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int
+    checkouts: dict[str, Path],
+    steps: Sequence[str],
+    photographs: int,
+    rounds: int,
 ) -> dict[str, dict[str, Any]]:
     """Least seconds and megabytes of each step in each checkout, measured in turn."""
     found = {name: {} for name in checkouts}

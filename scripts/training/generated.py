@@ -37,7 +37,12 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
     """
 
     def __init__(
-        self, length: int, *, seed: int = 0, image_size: int = 128, upright: float = 0.6
+        self,
+        length: int,
+        *,
+        seed: int = 0,
+        image_size: int = 128,
+        upright: float = 0.6,
     ) -> None:
         self._length = length
         self._seed = seed
@@ -102,7 +107,11 @@ def _numbered(number: int) -> TexturedMesh:
 
 
 def _crop_camera(
-    target: Placed, R: Array, t: Array, rng: Rng, size: int
+    target: Placed,
+    R: Array,
+    t: Array,
+    rng: Rng,
+    size: int,
 ) -> tuple[Array, tuple[int, int, int, int]]:
     """Camera matrix of the crop around a jittered box, and the part of the crop that lies within
     the photograph."""
