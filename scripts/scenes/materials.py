@@ -57,8 +57,10 @@ class Material:
             weight = is_letter & is_line & (along[:, 0] - row > 0.4)
         else:
             coarse = np.sin(17.0 * along).mean(axis=1)
-            weight = coarse * np.sin(31.0 * along[:, ::-1]).mean(axis=1) + 0.5
-        return self._first + self._strength * weight[:, None] * (self._second - self._first)
+            fine = np.sin(31.0 * along[:, ::-1]).mean(axis=1)
+            weight = coarse * fine + 0.5
+        mixed = self._strength * weight[:, None]
+        return self._first + mixed * (self._second - self._first)
 
 
 def random_picture(rng: Rng, size: int) -> Array:
@@ -87,7 +89,8 @@ def random_picture(rng: Rng, size: int) -> Array:
         picture = picture + rng.uniform(0.05, 0.35) * noise
     elif kind in (3, 4):
         picture = np.ascontiguousarray(picture)
-        for _ in range(int(rng.integers(3, 40 if kind == 3 else 120))):
+        most = 40 if kind == 3 else 120
+        for _ in range(int(rng.integers(3, most))):
             _draw_shape(picture, rng)
     return np.ascontiguousarray(np.clip(picture, 0, 1), dtype=np.float32)
 
@@ -134,13 +137,17 @@ def random_texture(rng: Rng, size: int = 256) -> Array:
         colour = colour * (0.75 + 0.25 * weave[..., None])
         return np.ascontiguousarray(colour, dtype=np.float32)
     grain = np.zeros((size, size), np.float32)  # boards with a grain along the columns
-    for rows, columns, strength in ((8, 2, 0.5), (64, 4, 0.5), (size // 2, 16, 0.3)):
-        noise = np.pad(rng.normal(size=(rows, columns)).astype(np.float32), 1, mode="wrap")
+    layers = ((8, 2, 0.5), (64, 4, 0.5), (size // 2, 16, 0.3))
+    for rows, columns, strength in layers:
+        noise = rng.normal(size=(rows, columns)).astype(np.float32)
+        noise = np.pad(noise, 1, mode="wrap")
         high = size // rows
         wide = size // columns
-        fine = cv2.resize(noise, (size + 2 * wide, size + 2 * high), interpolation=cv2.INTER_CUBIC)
+        shape = (size + 2 * wide, size + 2 * high)
+        fine = cv2.resize(noise, shape, interpolation=cv2.INTER_CUBIC)
         grain += strength * fine[high : high + size, wide : wide + size]
-    grain += rng.normal(0, 0.5, 4)[np.floor(4 * y).astype(int)]
+    tones = rng.normal(0, 0.5, 4)
+    grain += tones[np.floor(4 * y).astype(int)]
     gap = np.abs(4 * y - np.round(4 * y)) < 0.012
     brown = rng.uniform(0.4, 1.6) * np.array([0.42, 0.25, 0.13])
     colour = brown * np.exp(0.16 * grain[..., None])

@@ -22,7 +22,8 @@ def label(rng: Rng) -> np.ndarray:
     picture = np.full((HEIGHT, WIDTH, 3), 255 * random_colour(rng), np.float32)
     for _ in range(rng.integers(0, 4)):
         top = int(rng.integers(HEIGHT))
-        picture[top : top + int(rng.integers(5, 60))] = 255 * random_colour(rng)
+        colour = 255 * random_colour(rng)
+        picture[top : top + int(rng.integers(5, 60))] = colour
     for _ in range(rng.integers(2, 5)):
         side = int(rng.integers(50, 150))
         x = int(rng.integers(WIDTH - side))
@@ -30,12 +31,15 @@ def label(rng: Rng) -> np.ndarray:
         picture[y : y + side, x : x + side] = 255 * random_picture(rng, side)
     picture = picture.clip(0, 255).round().astype(np.uint8)
     for _ in range(rng.integers(5, 16)):
-        word = "".join(rng.choice(list(LETTERS), rng.integers(2, 9)))
+        length = rng.integers(2, 9)
+        word = "".join(rng.choice(list(LETTERS), length))
         scale = float(rng.uniform(0.4, 2.5))
-        place = (int(rng.integers(WIDTH)), int(rng.integers(20, HEIGHT)))
-        colour = tuple((255 * random_colour(rng)).tolist())
+        x = int(rng.integers(WIDTH))
+        y = int(rng.integers(20, HEIGHT))
+        colour = (255 * random_colour(rng)).tolist()
         font = FONTS[rng.integers(len(FONTS))]
-        cv2.putText(picture, word, place, font, scale, colour, 1 + int(1.5 * scale), cv2.LINE_AA)
+        thick = 1 + int(1.5 * scale)
+        cv2.putText(picture, word, (x, y), font, scale, colour, thick, cv2.LINE_AA)
     return picture
 
 
@@ -87,11 +91,13 @@ def carton(rng: Rng) -> tuple[np.ndarray, ...]:
     corners = solid.triangles.reshape(6, 6, 3)  # two triangles a side
     uv = np.zeros((6, 6, 2))
     for k, side in enumerate(corners):
-        axes = np.sort(np.argsort(np.ptp(side, axis=0))[1:])
-        flat = side[:, axes]
+        by_extent = np.argsort(np.ptp(side, axis=0))
+        flat = side[:, np.sort(by_extent[1:])]
         inside = (flat - flat.min(axis=0)) / np.ptp(flat, axis=0)
-        uv[k] = (np.array([k % 3, k // 3]) + inside) / (3.0, 2.0)
-    return corners.reshape(-1, 3), np.arange(36).reshape(-1, 3), uv.reshape(-1, 2)
+        place = np.array([k % 3, k // 3])
+        uv[k] = (place + inside) / (3.0, 2.0)
+    faces = np.arange(36).reshape(-1, 3)
+    return corners.reshape(-1, 3), faces, uv.reshape(-1, 2)
 
 
 def package(rng: Rng, print_rng: Rng | None = None) -> TexturedMesh:

@@ -72,7 +72,9 @@ def single(
     target = Placed.standing(mesh, turn, 1.0 / mesh.radius, obj_id=obj_id)
     hull = target.hull
     fill = rng.uniform(0.25, 0.65) * min(SIZE)
-    elevation = float(rng.choice([rng.uniform(-4, 25), rng.uniform(5, 60)]))
+    low = rng.uniform(-4, 25)
+    high = rng.uniform(5, 60)
+    elevation = float(rng.choice([low, high]))
     azimuth = rng.uniform(0, 360)
     view = look_at(hull, rng, fill=fill, azimuth=azimuth, elevation=elevation)
     R, t, _ = view
@@ -346,7 +348,8 @@ def _clutter(
         turn = _rotation(0.0, 0.0, rng.uniform(0, 360))
         if rng.random() < 0.15:
             turn = random_rotation(rng)
-        radius = 0.5 * scale * float(np.linalg.norm(np.ptp(mesh.hull, axis=0)[:2]))
+        width, depth, _ = np.ptp(mesh.hull, axis=0)
+        radius = 0.5 * scale * float(np.linalg.norm((width, depth)))
         if front:
             x, y = eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9)
             aside = np.array([-y, x]) * rng.uniform(-0.8, 0.8)

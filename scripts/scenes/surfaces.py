@@ -92,33 +92,38 @@ def _circle(n: int = AROUND) -> Array:
 
 def loft(outlines: Array, heights: ArrayLike) -> Surface:
     """Closed surface through (M, N, 2) outlines at (M,) heights along z."""
-    z = np.broadcast_to(np.asarray(heights, dtype=float)[:, None, None], (*outlines.shape[:2], 1))
+    levels = np.asarray(heights, dtype=float)[:, None, None]
+    z = np.broadcast_to(levels, (*outlines.shape[:2], 1))
     return grid(np.concatenate([outlines, z], -1))
 
 
 def box(size: ArrayLike, *, top: float = 1.0) -> Surface:
     """Box of (3,) ``size`` around the origin; the upper end is scaled by ``top``."""
-    x, y, z = (0.5 * float(s) for s in np.broadcast_to(np.asarray(size, dtype=float), 3))
+    x, y, z = 0.5 * np.broadcast_to(np.asarray(size, dtype=float), 3)
     square = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
-    return loft(np.stack([square, top * square]), np.array([-z, z]))
+    outlines = np.stack([square, top * square])
+    return loft(outlines, np.array([-z, z]))
 
 
 def rounded_box(rng: Rng, size: ArrayLike) -> Surface:
     """A box of side lengths ``size``, with sharp or rounded edges."""
     if rng.random() < 0.5:
-        return box(size, top=rng.choice([1.0, rng.uniform(0.7, 1.0)]))
+        narrower = rng.uniform(0.7, 1.0)
+        return box(size, top=rng.choice([1.0, narrower]))
     e = rng.uniform(0.1, 0.5)
     return superquadric(0.5 * np.asarray(size), (e, e))
 
 
 def extrude(outline: Array, height: float) -> Surface:
     """Extrusion of an outline (N, 2), star-shaped about its mean, by ``height`` around z = 0."""
-    return loft(np.stack([outline, outline]), np.array([-0.5 * height, 0.5 * height]))
+    half = 0.5 * height
+    return loft(np.stack([outline, outline]), np.array([-half, half]))
 
 
 def lathe(radii: ArrayLike, heights: ArrayLike) -> Surface:
     """Surface of revolution about z through (M,) radii at (M,) heights."""
-    return loft(np.asarray(radii, dtype=float)[:, None, None] * _circle(), heights)
+    radii = np.asarray(radii, dtype=float)[:, None, None]
+    return loft(radii * _circle(), heights)
 
 
 def disc(radius: float, low: float, high: float) -> Surface:
@@ -148,7 +153,8 @@ def torus(radius: float, thickness: float) -> Surface:
     section = thickness * _circle(10)
     flat = around[:, None] * (radius + section[:, :1])
     height = np.broadcast_to(section[:, 1:], (*flat.shape[:2], 1))
-    return grid(np.concatenate([flat, height], -1), caps=False)
+    points = np.concatenate([flat, height], -1)
+    return grid(points, caps=False)
 
 
 def bar(
@@ -161,21 +167,23 @@ def bar(
     """Straight rod between two points; ``sides=4`` makes it square."""
     a = np.asarray(start, dtype=float)
     b = np.asarray(end, dtype=float)
-    axis = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
-    side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
+    length = float(np.linalg.norm(b - a))
+    axis = (b - a) / max(length, 1e-9)
+    shortest = int(np.abs(axis).argmin())
+    side = np.cross(axis, np.eye(3)[shortest])
     side /= np.linalg.norm(side)
     frame = np.stack([side, np.cross(axis, side)])
-    ring = radius * unit_circle(2 * np.pi * (np.arange(sides) + 0.5) / sides) @ frame
+    angles = 2 * np.pi * (np.arange(sides) + 0.5) / sides
+    ring = radius * unit_circle(angles) @ frame
     return grid(np.stack([a + ring, b + ring]))
 
 
 def join(surfaces: list[Surface]) -> Surface:
     """One surface of several."""
-    vertices = []
+    vertices = np.concatenate([surface.vertices for surface in surfaces])
     faces = []
     count = 0
     for surface in surfaces:
-        vertices.append(surface.vertices)
         faces.append(surface.faces + count)
         count += len(surface.vertices)
-    return Surface(np.concatenate(vertices), np.concatenate(faces))
+    return Surface(vertices, np.concatenate(faces))

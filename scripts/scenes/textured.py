@@ -143,7 +143,8 @@ class TexturedMesh:
         coded = (255 * picture[..., ::-1] ** (1 / 2.2) + 0.5).astype(np.uint8)
         cv2.imwrite(str(path.with_suffix(".png")), coded)
         count = 3 * len(self.triangles)
-        normals = self.normals / (np.linalg.norm(self.normals, axis=2, keepdims=True) + 1e-12)
+        lengths = np.linalg.norm(self.normals, axis=2, keepdims=True)
+        normals = self.normals / (lengths + 1e-12)
         vertices = np.concatenate([1000.0 * self.triangles, normals, uv], axis=2).astype("<f4")
         faces = np.zeros(count // 3, [("n", "u1"), ("v", "<i4", 3)])
         faces["n"] = 3
@@ -283,8 +284,10 @@ def barycentric(triangles: Array, points: Array) -> Array:
     c = triangles[:, 2]
     normal = np.cross(b - a, c - a)
     area = (normal * normal).sum(axis=1) + 1e-30
-    u = (np.cross(c - b, points - b) * normal).sum(axis=1) / area
-    v = (np.cross(a - c, points - c) * normal).sum(axis=1) / area
+    of_a = np.cross(c - b, points - b)
+    of_b = np.cross(a - c, points - c)
+    u = (of_a * normal).sum(axis=1) / area
+    v = (of_b * normal).sum(axis=1) / area
     weights = np.clip(np.stack([u, v, 1 - u - v], axis=1), 0, 1)
     return weights / weights.sum(axis=1, keepdims=True)
 
