@@ -3,8 +3,11 @@ ImageNet."""
 
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
+
+from PIL import Image
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.aliases import PathName
@@ -59,8 +62,8 @@ class Pascal3DPlus(ObjectDataset):
 
     Reasons in ``skipped``: ``other_class`` (a file lists all objects of the photograph),
     ``occluded``, ``truncated``, ``difficult``, ``no_viewpoint``, ``coarse_viewpoint`` (only coarse
-    bins were labelled), ``bad_box`` (no area), ``missing_annotation``, ``corrupt_annotation``,
-    ``missing_image``, ``missing_mesh``.
+    bins were labelled), ``bad_box`` (no area), ``bad_image_size`` (another one than the annotation
+    states), ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``.
 
     Raises:
         MissingFileError: the root or an image list does not exist.
@@ -161,6 +164,9 @@ class Pascal3DPlus(ObjectDataset):
             if objects is None:
                 self._skip("corrupt_annotation", item)
                 continue
+            if _is_resized(image, record):
+                self._skip("bad_image_size", item)
+                continue
             for index, entry in enumerate(objects):
                 ids = {"image_path": str(image), "image_id": image_id, "object_index": index}
                 self._add(self._parse(entry, category), f"{item} #{index}", **ids)
@@ -202,6 +208,15 @@ class Pascal3DPlus(ObjectDataset):
             "cad_path": str(cad),
             **flags,
         }
+
+
+def _is_resized(image: Path, record: Any) -> bool:
+    """Whether a photograph has another size than its annotation states; a file that cannot be read
+    says so when its pixels are."""
+    stated = record[0].get("imgsize")
+    with suppress(Exception), Image.open(image) as file:  # Pillow raises errors of any kind
+        return isinstance(stated, list) and stated[:2] != list(file.size)
+    return False
 
 
 def _number(value: MatValue) -> float | None:

@@ -6,7 +6,7 @@ import torch
 from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.errors import ImageError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint
-from tests._support.miniature import pascal_object, write_pascal3d, write_record
+from tests._support.miniature import pascal_object, write_image, write_pascal3d, write_record
 
 
 @pytest.fixture
@@ -109,6 +109,19 @@ def test_pascal3d_defaults_of_missing_camera_fields_and_invalid_cad_indices(tree
     write_record(record, [pascal_object("car", cad_index=index) for index in invalid])
     skipped = Pascal3DPlus(tree[0], categories=["car"]).skipped
     assert skipped["missing_mesh"] == before + len(invalid)
+
+
+def test_photographs_of_another_size_than_annotated_are_left_out(tree):
+    resized = tree[0] / "Images" / "car_pascal" / "2008_000002.jpg"
+    write_image(resized, (30, 40))
+    dataset = Pascal3DPlus(tree[0], categories=["car"])
+    assert dataset.skipped_items["bad_image_size"] == ["car_pascal/2008_000002"]
+    assert [dataset.annotation(i)["image_id"] for i in range(len(dataset))] == [
+        "2008_000001",
+        "2008_000003",
+    ]
+    resized.write_bytes(b"no picture")  # its pixels say so
+    assert "bad_image_size" not in Pascal3DPlus(tree[0], categories=["car"]).skipped
 
 
 def test_pascal3d_reports_missing_files_with_advice_and_refuses_invalid_options(tree, tmp_path):
