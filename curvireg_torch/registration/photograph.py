@@ -167,9 +167,11 @@ def as_photographs(
     the photograph, and its distortion removed; a file without one has the camera of its EXIF data.
     A box of which less than ``MIN_BOX_SIDE`` px lie inside its photograph in a direction is
     refused."""
-    if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
+    is_list = isinstance(images, Sequence) and not isinstance(images, str)
+    if not is_list and getattr(images, "ndim", None) != 4:
         raise InvalidInputError(
-            "images: expected a batch (B, C, H, W) or a list; put a single image into a list"
+            f"images: expected a batch (B, C, H, W) or a list, got {type(images).__name__}; put a "
+            f"single image into a list, and make one of other collections: list(images)"
         )
     n = len(images)
     no_box = boxes is None

@@ -221,6 +221,9 @@ def test_registrar_accepts_tensors_arrays_and_paths_and_rejects_bad_calls(tmp_pa
         ([IMAGE], BOX[None], CAMERA.expand(2, 3, 3), r"expected \(3, 3\) or \(1, 3, 3\)"),
         ([IMAGE], BOX.expand(3, 4), None, r"shape \(1, 4\), one for each image, got \(3, 4\)"),
         (IMAGE, BOX[None], None, "put a single image into a list"),
+        # not in the order of the boxes: a column of a table is indexed by labels
+        ({1: IMAGE, 0: IMAGE}, BOX.expand(2, 4), None, r"got dict; .*list\(images\)"),
+        (iter([IMAGE]), BOX[None], None, r"got list_iterator; .*list\(images\)"),
     ):
         with pytest.raises(InvalidInputError, match=message):
             registrar(images, boxes, camera)
