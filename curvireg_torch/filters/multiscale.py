@@ -7,7 +7,13 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_integer, check_option, check_positive, check_tensor
+from ..utils.checks import (
+    check_image,
+    check_integer,
+    check_option,
+    check_positive,
+    check_tensor,
+)
 from . import operations as ops
 from .curvilinear import scaled_direction
 from .modules import FunctionModule
@@ -49,6 +55,7 @@ def anisotropic_diffusion(
         torch.Size([1, 3, 16, 16])
     """
     check_tensor(image, "image", (None, None, None, None))
+    check_image(image[:, :1])
     check_option(conductance, ("rational", "exponential"), "conductance")
     check_integer(iterations, "iterations", least=0)
     kappa = ops.check_scalar(kappa, "kappa")

@@ -199,6 +199,7 @@ class LayerContract:
         wrong = [
             (x[0], "expected shape"),
             (x.byte(), r"expected a floating dtype, got torch\.uint8"),
+            (x[..., :0], "at least"),
         ]
         if case.accepts_colour:
             wrong.append((x.repeat(1, 4, 1, 1), "got"))
