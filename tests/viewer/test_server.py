@@ -76,6 +76,7 @@ def test_a_page_answers_to_its_own_names_and_origins_only():
         "null",
         "http://127.0.0.1:9000",
         "http://localhost:8080",
+        "http://[",
         "",
     ):
         assert status("127.0.0.1", origin=origin) == status("0.0.0.0", origin=origin) == 403, origin
