@@ -1,6 +1,7 @@
 """OpenCV pinhole cameras, projection, and poses from the box that an object fills."""
 
 import math
+from functools import reduce
 
 import torch
 import torch.nn.functional as F
@@ -11,6 +12,7 @@ from ..utils.aliases import Size
 from ..utils.checks import (
     check_camera_matrix,
     check_finite,
+    check_last_axes,
     check_number,
     check_pose,
     check_rotation,
@@ -106,9 +108,12 @@ def project_points(
         >>> project_points(torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64), T, K).tolist()
         [[100.0, 50.0]]
     """
+    check_last_axes(points, "points", (None, 3))
     check_pose(T_cam_from_model, "T_cam_from_model")
     check_camera_matrix(K)
-    return projected(points, T_cam_from_model, K, orthographic=orthographic)
+    given = points, T_cam_from_model, K
+    dtype = reduce(torch.promote_types, (x.dtype for x in given))
+    return projected(*(x.to(dtype) for x in given), orthographic=orthographic)
 
 
 def projected(

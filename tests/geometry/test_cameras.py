@@ -11,7 +11,7 @@ from curvireg_torch.geometry.cameras import point_in_cameras, pose_around
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
-from tests._support import double, eye, seeded
+from tests._support import double, eye, refused, seeded
 
 K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
 
@@ -28,6 +28,12 @@ def test_project_points_agrees_with_opencv():
     assert_allclose(ours, expected, atol=1e-9)
     box = g.projected_boxes(torch.from_numpy(X), T, K)
     assert_allclose(box, [*expected.min(0), *expected.max(0)], atol=1e-9)
+    mixed = g.project_points(torch.from_numpy(X).float(), T, K.float())
+    assert mixed.dtype == torch.float64
+    assert_allclose(mixed, expected, atol=1e-3)
+    for wrong, message in ((X, "got ndarray"), (torch.ones(40, 2), r"shape \(\*, 3\)")):
+        with refused(f"points: expected .*{message}"):
+            g.project_points(wrong, T, K)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3])
