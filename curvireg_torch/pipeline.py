@@ -347,6 +347,10 @@ class Pipeline:
     def with_field(self, field: nn.Module) -> "Pipeline":
         """A copy that records a custom module as the photograph's field, by class name and
         digest."""
+        if not isinstance(field, nn.Module):
+            raise InvalidInputError(
+                f"field: expected a module such as ImageGradient(), got {field!r:.60}"
+            )
         return replace(self, field=f"{CUSTOM}{type(field).__name__}", weights=field_digest(field))
 
     def photograph_field(self) -> nn.Module:

@@ -116,6 +116,7 @@ def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | 
     else:
         out = field(crops)
         mask = field.mask(crops) if isinstance(field, LearnedCurvilinearSaliency) else None
+    check_tensor(out, "field", (len(crops), 2, *crops.shape[2:]))
     return out if holes is None else out.masked_fill(holes.any(dim=1, keepdim=True), 0.0), mask
 
 

@@ -190,7 +190,7 @@ def crop_squares(image: Tensor, squares: Tensor, size: int) -> Tensor:
 
     crops = resampled(x)
     # 0 times NaN is NaN: one missing pixel would spread along its row and column
-    if not math.isfinite(float(crops.sum())):
+    if not math.isfinite(float(crops.detach().sum())):
         missing = ~x.isfinite()
         crops = torch.where(
             resampled(missing.to(dtype)) > 0, torch.nan, resampled(torch.where(missing, 0.0, x))

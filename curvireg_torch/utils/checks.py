@@ -75,7 +75,7 @@ def check_photograph(x: Any, name: str = "images") -> None:
 def check_pixels(x: Tensor, where: str) -> None:
     """The pixels of floating ``x`` are finite and in [0, 1] within 0.001; ``where`` names them, as
     "of the box"."""
-    low, high = (float(value) for value in x.aminmax()) if x.numel() else (0.0, 0.0)
+    low, high = (float(value) for value in x.detach().aminmax()) if x.numel() else (0.0, 0.0)
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ImageError(f"NaN or inf in the pixels {where}; repair the image, or use another")
     if high > 1.0 + 1e-3 or low < -1e-3:

@@ -2,17 +2,20 @@
 
 import copy
 import pickle
+import warnings
 from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 from torch.testing import assert_close
 
 from curvireg_torch import Registrar, ViewMatcher, terms
 from curvireg_torch.features import LearnedCurvilinearSaliency
+from curvireg_torch.filters import ImageGradient
 from curvireg_torch.registration import Follower
 from curvireg_torch.terms import Correlation, QueryFeatures
-from tests._support import CAMERA, refused, scene, sequence, slow_after
+from tests._support import CAMERA, refused, scene, sequence, slow_after, truck_bank
 
 
 @pytest.fixture(scope="module")
@@ -198,6 +201,24 @@ def test_a_hook_of_any_kind_calls_the_field(kind):
     crops = torch.rand(1, 3, 32, 32, requires_grad=True)
     terms.photograph_field(field, crops)[0].sum().backward()
     assert called == [kind]
+
+
+def test_gradients_reach_the_photograph_without_a_warning():
+    image, box, _ = scene(0)
+    image.requires_grad_()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ViewMatcher(truck_bank())([image], box[None]).scores.sum().backward()
+    assert float(image.grad.abs().amax()) > 0.0
+
+
+def test_a_custom_field_is_a_module_that_keeps_the_size():
+    with refused(r"field: expected a module such as ImageGradient\(\), got <class"):
+        ViewMatcher(truck_bank(), field=ImageGradient)
+    crops = torch.rand(3, 1, 32, 32)
+    for wrong in (nn.Conv2d(1, 2, 3), nn.Conv2d(1, 1, 1)):
+        with refused(r"field: expected shape \(3, 2, 32, 32\), got"):
+            terms.photograph_field(wrong, crops)
 
 
 @pytest.mark.parametrize(
