@@ -10,7 +10,7 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..geometry.cameras import point_in_cameras, transform
 from ..mesh.mesh import Mesh, mesh_centre, mesh_radius
-from ..utils.checks import check_camera_matrix, check_pose, check_tensor
+from ..utils.checks import check_camera_matrix, check_integer, check_pose, check_tensor
 
 # Near plane, in object radii: surface closer to the camera plane, or behind it, is not rendered
 NEAREST = 1e-3
@@ -85,10 +85,12 @@ class MeshRenderer:
 def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Rigid poses (N, 4, 4), or one (4, 4), and cameras (N, 3, 3), checked, as float64 on the
     CPU."""
-    T = T[None] if T.ndim == 2 else T
+    T = T[None] if getattr(T, "ndim", 0) == 2 else T
     check_tensor(T, "T_cam_from_model", (None, 4, 4))
-    if len(size) != 2 or min(size) < 1:
-        raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")
+    if not hasattr(size, "__len__") or len(size) != 2:
+        raise InvalidInputError(f"size: expected (H, W), got {size}")
+    for side in size:
+        check_integer(side, "size")
     check_camera_matrix(K)
     if K.ndim == 3 and K.shape[0] not in (1, T.shape[0]):
         raise InvalidInputError(

@@ -99,7 +99,9 @@ def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails(
         ((not_finite, one, size), "finite"),
         ((T, one.expand(3, 3, 3), size), "one or 2 matrices"),
     ]
-    for arguments, message in (*calls, ((T, one, (0, 5)), "size")):
+    calls += [((T, one, wrong), "size: expected") for wrong in ((0, 5), (4.0, 4.0), (4, 4, 3), 64)]
+    calls.append((([[1.0]], one, size), r"T_cam_from_model: expected a torch\.Tensor, got list"))
+    for arguments, message in calls:
         with refused(message):
             cr.render_depth(box, *arguments)
     with refused("'embree'"):
