@@ -26,6 +26,7 @@ from ..registration.refinement import refine_prepared
 from ..registration.registrar import ObjectLike
 from ..registration.result import Results
 from ..registration.several import register_prepared_views
+from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
@@ -174,8 +175,8 @@ def _camera(
         return given
     if isinstance(given, str | PathLike):
         return "exif" if given == "exif" else load_camera(given)
-    K: Any = given
-    return tuple(K) if isinstance(K, Sequence) and len(K) == 4 else Camera(K)
+    numbers = as_numbers(given, "camera", dtype=torch.float64)
+    return tuple(numbers.tolist()) if numbers.shape == (4,) else Camera(numbers)
 
 
 def register_entry(

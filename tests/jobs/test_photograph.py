@@ -60,10 +60,13 @@ def test_register_takes_pictures_of_other_kinds(folder, result):
     numbers = [float(v) for v in box]
     with Image.open(folder / "photos" / "0.png") as picture:
         pixels = np.array(picture.convert("RGB"))
-        for image in (picture, pixels, torch.from_numpy(pixels).permute(2, 0, 1)):
-            same = cr.register(
-                image, registrar, box=numbers, camera=cr.camera_matrix(*map(float, CAMERA))
-            )
+        four = np.array(list(map(float, CAMERA)))
+        for image, camera in (
+            (picture, cr.camera_matrix(*four)),
+            (pixels, four),
+            (torch.from_numpy(pixels).permute(2, 0, 1), torch.from_numpy(four)),
+        ):
+            same = cr.register(image, registrar, box=numbers, camera=camera)
             assert same.rotation.equal(result.rotation)
 
 
