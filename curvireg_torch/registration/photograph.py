@@ -58,9 +58,7 @@ OFF_MIDDLE = 0.1
 SAME_PLACE = 1e-4
 # Correlation of small copies of two photographs from which they may come from the same place
 SAME_PICTURE = 0.8
-# Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with
-# the box of the pose on 60 generated photographs
-SAME_BOX_OVERLAP = 0.85
+SAME_BOX_OVERLAP = 0.98  # (IoU) from which two boxes count as the same
 # Part of a box without pixels of the photograph, from which a result carries a warning
 MISSING_SHARE = 0.2
 

@@ -239,8 +239,8 @@ class Registration:
         confidence_features: what the confidence is computed from, see
             :func:`.confidence.confidence_features`.
         detection: where the object was found; None if its box was given.
-        corrected_box: (4,) float64, the box that replaced a given one that did not fit the pose;
-            else None.
+        corrected_box: (4,) float64, the box around a pose that replaced the given one, because the
+            photograph agrees better with what was found in it; else None.
         prior: the limits on the pose that were given.
         prior_contradiction: "better outside": a pose outside the limits fits better, or the box
             asks for a distance outside; "at the limit": the pose lies within a degree, or 1 % of
@@ -335,14 +335,17 @@ class Registration:
         return "several" if named is None and self.feature_is_hidden else named
 
     @property
+    def is_doubtful(self) -> bool:
+        """Whether the confidence is unknown or below ``reliable_from``."""
+        return self.confidence is None or not self.confidence >= self.reliable_from
+
+    @property
     def reliable(self) -> bool:
         """Whether the confidence is at least ``reliable_from``, without ``warnings`` or a better
         pose outside the prior, and the contours determine the rotation, or as many keypoints agree
         as a pose can begin from; if False, the pose is a guess."""
         best = self.hypotheses[0]
-        if self.confidence is None or not self.confidence >= self.reliable_from:
-            return False
-        if self.is_questioned:
+        if self.is_doubtful or self.is_questioned:
             return False
         if best.translation is None or best.edge_support is None:  # nothing to determine them by
             return True

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError
+from ..evidence import EvidenceWeights
 from ..fitting.edges import EdgeCrops
 from ..geometry.framing import hidden_boxes, whole_boxes
 from ..matching import Ranking
@@ -59,6 +60,8 @@ BLOCK = {"cpu": 16}
 Measured on a CPU, 16 photographs of one mesh: blocks of 16 take 9 to 12 % less processor time than
 blocks of 8, and 4 to 8 % more memory (1.14 GB at 640 x 480, 1.71 GB at 4000 x 3000)."""
 BLOCK_OF_DEVICE = 64
+CORRECTED_BOXES = 2  # around poses in which a doubtful photograph is registered again, at most
+LEAST_CONFIDENCE = 0.005  # from where, and up to 1 minus which, confidences of boxes are compared
 VIEWS_OF_HIDDEN = 4  # best views that are tried in each box of an object behind an occluder
 
 
@@ -126,39 +129,55 @@ def failure(error: CurviregError, index: int) -> FailedRegistration:
 
 
 def _with_corrected_boxes(target: Target, items: Items, results: Sequence[Result]) -> list[Result]:
-    """Results, with those of another box where the pose asks for one in which it is seen better."""
-    found = list(results)
-    changed: dict[int, Photograph] = {}
-    boxes: dict[int, Tensor] = {}
-    for index, (item, result) in enumerate(zip(items, results, strict=True)):
-        if isinstance(item, Photograph) and isinstance(result, Registration):
-            box = _other_box(target, item, result)
-            if box is not None:
-                boxes[index] = box
-                changed[index] = replace(item, box=box.float())
+    """Results; a doubtful photograph is registered again in the box around its best pose, and if it
+    is doubtful still, in that around the second. What agrees best with it stands."""
+    first = {k: result for k, result in enumerate(results) if isinstance(result, Registration)}
+    best = dict(first)
+    tried = {k: [item] for k, item in enumerate(items) if isinstance(item, Photograph)}
     weights = target.score_weights(exact=True)
-    others = register_boxes(target, list(changed.values()))
-    for index, other in zip(changed, others, strict=True):
-        result = found[index]
-        if not isinstance(other, Registration) or not isinstance(result, Registration):
-            continue
-        before = common_score(result.hypotheses[0], weights)
-        if common_score(other.hypotheses[0], weights) > before:
-            found[index] = replace(other, corrected_box=boxes[index])
-    return found
+    for rank in range(CORRECTED_BOXES):
+        again: dict[int, Photograph] = {}
+        for k, result in first.items():
+            other_box = _in_box_of_pose(target, tried[k], result, rank)
+            if best[k].is_doubtful and other_box is not None:
+                again[k] = other_box
+                tried[k].append(other_box)
+        others = register_boxes(target, list(again.values()))
+        for (k, item), other in zip(again.items(), others, strict=True):
+            if not isinstance(other, Registration):
+                continue
+            if _agreement(other, weights) > _agreement(best[k], weights):
+                best[k] = replace(other, corrected_box=item.box.double())
+    return [best.get(k, result) for k, result in enumerate(results)]
 
 
-def _other_box(target: Target, item: Photograph, result: Registration) -> Tensor | None:
-    """The box of the pose that was found, if the photograph shows another part in it."""
+def _agreement(result: Registration, weights: EvidenceWeights) -> float:
+    """How well a result agrees with its photograph, comparable with those in other boxes."""
+    agreement = common_score(result.hypotheses[0], weights)
+    if result.confidence is None:
+        return agreement
+    log_odds = torch.tensor(result.confidence).logit(LEAST_CONFIDENCE)
+    return agreement + float(log_odds)
+
+
+def _in_box_of_pose(
+    target: Target, tried: Sequence[Photograph], result: Registration, rank: int
+) -> Photograph | None:
+    """The photograph with the box around the hypothesis of this ``rank``, if that shows another
+    part of it than the boxes that were ``tried``."""
     # Without a camera, poses are derived from their boxes.
     if not (target.pipeline.box_jitter and target.pipeline.contours and result.camera is not None):
         return None
-    if target.boxes_are_visible:  # the pose's box is that of the whole object
+    # the pose's box is that of the whole object
+    if target.boxes_are_visible or rank >= len(result.hypotheses):
         return None
-    box = projected_box(target.describer, result.projection)
+    item = tried[0]
+    box = projected_box(target.describer, result.hypotheses[rank].projection)
     # in a frame and without one, similarities mean different things
     alike = target.has_frame(item.box, item.size) == target.has_frame(box, item.size)
-    return box if alike and item.shows_other_part(box) else None
+    if alike and all(other.shows_other_part(box) for other in tried):
+        return replace(item, box=box.float())
+    return None
 
 
 def register_boxes(target: Target, items: Items) -> list[Result]:

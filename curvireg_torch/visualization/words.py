@@ -30,7 +30,7 @@ def remarks(document: Document) -> list[str]:
     symmetric mesh."""
     box = document["corrected_box"]
     contradiction = document.get("prior", {}).get("contradiction")
-    lines = [] if box is None else [f"the box did not fit the pose; one that does: {corners(box)}"]
+    lines = [] if box is None else [f"another box agrees better with the pose: {corners(box)}"]
     if contradiction == "better outside":
         lines.append("the photograph fits much better outside the pose prior; check it")
     elif contradiction is not None:

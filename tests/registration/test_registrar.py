@@ -301,27 +301,76 @@ def test_wrong_box_is_corrected():
     assert result.to_dict()["corrected_box"] == result.corrected_box.tolist()
 
 
+def registered_in_boxes(monkeypatch, *results):
+    """The answer in a wrong box, if registrations yield these results, and the boxes of all."""
+    answers = iter(results)
+    boxes = []
+
+    def register_boxes(_, items):
+        boxes.extend(item.box.tolist() for item in items)
+        return [next(answers) for _ in items]
+
+    monkeypatch.setattr(stages, "register_boxes", register_boxes)
+    return answer_of(truck_registrar(), IMAGE, WRONG), boxes
+
+
+def plain_result():
+    """A registration in the right box."""
+    return truck_registrar(box_jitter=0.0)([IMAGE], BOX[None], CAMERA)[0]
+
+
+def with_evidence(result, **evidence):
+    best = result.hypotheses[0]
+    return replace(result, hypotheses=(replace(best, evidence=best.evidence | evidence),))
+
+
 @pytest.mark.parametrize(
-    ("better", "evidence"),
-    [(True, {"similarity": 0.71}), (False, {"similarity": 0.69}), (True, {"keypoints": 2.0})],
+    ("better", "confidence", "evidence"),
+    [
+        (True, 0.5, {"similarity": 0.71}),
+        (False, 0.5, {"similarity": 0.69}),
+        (True, 0.5, {"keypoints": 2.0}),
+        (True, 0.6, {}),
+        (False, 0.4, {}),
+        (False, 0.4, {"similarity": 0.701}),
+        (True, 1.0, {"similarity": 0.69}),
+    ],
 )
-def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evidence):
+def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, confidence, evidence):
     """Evidence that depends on the box, as the rank does, is not compared."""
-    registrar = truck_registrar()
-    one = truck_registrar(box_jitter=0.0)([IMAGE], BOX[None], CAMERA)[0]
-    best = one.hypotheses[0]
-    first, other = (
-        replace(one, hypotheses=(replace(best, evidence=best.evidence | known),))
-        for known in (
-            {"similarity": 0.7, "rank": 0.0},
-            {"similarity": 0.7, "rank": -3.0} | evidence,
-        )
-    )
-    answers = iter([first, other])
-    monkeypatch.setattr(stages, "register_boxes", lambda *_: [next(answers)])
-    result = answer_of(registrar, IMAGE, WRONG)
+    one = replace(plain_result(), probabilities=(0.5,))
+    first = with_evidence(one, similarity=0.7, rank=0.0)
+    other = with_evidence(one, **{"similarity": 0.7, "rank": -3.0} | evidence)
+    other = replace(other, probabilities=(confidence,))
+    result, boxes = registered_in_boxes(monkeypatch, first, other)
     assert (result.hypotheses is first.hypotheses) != better
     assert (result.corrected_box is None) != better
+    assert len(boxes) == 2
+
+
+def test_only_doubtful_photographs_are_registered_again(monkeypatch):
+    """In the box around the best pose, then in that around the second, each box once."""
+    one = plain_result()
+    sure = replace(one, probabilities=(one.reliable_from,))
+    doubtful = replace(one, probabilities=(one.reliable_from - 0.01,))
+    right = one.hypotheses[0]
+    T, K = right.projection
+    nearer = torch.eye(4, dtype=T.dtype)
+    nearer[2, 3] = -0.1 * float(T[2, 3])
+    other = replace(right, projection=(nearer @ T, K))
+    two = replace(doubtful, hypotheses=(right, other), probabilities=(0.5, 0.3))
+    assert len(registered_in_boxes(monkeypatch, sure)[1]) == 1
+    assert len(registered_in_boxes(monkeypatch, doubtful, sure)[1]) == 2
+    assert len(registered_in_boxes(monkeypatch, two, sure)[1]) == 2
+    result, boxes = registered_in_boxes(monkeypatch, two, doubtful, sure)
+    given, first, second = (double(box) for box in boxes)
+    torch.testing.assert_close(given, WRONG.double())
+    torch.testing.assert_close(first, BOX.double(), atol=2.0, rtol=0.0)
+    sides = torch.stack([box[2:] - box[:2] for box in (first, second)])
+    torch.testing.assert_close(sides[1], sides[0] / 0.9, atol=2.0, rtol=0.0)
+    torch.testing.assert_close(result.corrected_box, second)
+    same = replace(two, hypotheses=(right, right))
+    assert len(registered_in_boxes(monkeypatch, same, doubtful)[1]) == 2
 
 
 # Half-way between two views of a coarse bank, so that both lead to the same pose
