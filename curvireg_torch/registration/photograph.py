@@ -58,7 +58,6 @@ OFF_MIDDLE = 0.1
 SAME_PLACE = 1e-4
 # Correlation of small copies of two photographs from which they may come from the same place
 SAME_PICTURE = 0.8
-SAME_BOX_OVERLAP = 0.98  # (IoU) from which two boxes count as the same
 # Part of a box without pixels of the photograph, from which a result carries a warning
 MISSING_SHARE = 0.2
 
@@ -134,14 +133,14 @@ class Photograph:
             )
         return (*found, *self.notes)
 
-    def shows_other_part(self, box: Tensor) -> bool:
-        """Whether a box (4,) is partly inside the photograph and shows another part of it than the
-        item's box."""
+    def overlap(self, box: Tensor) -> float:
+        """IoU of a box (4,) and the item's inside the photograph; 1 for one outside, where nothing
+        is to be seen."""
         H, W = self.size
         pair = torch.stack([box, self.box.to(box)]).clamp(min=-0.5)
         pair = torch.minimum(pair, torch.tensor([W, H, W, H]).to(pair) - 0.5)
         inside = bool((pair[0, 2:] > pair[0, :2]).all()) and bool(box.isfinite().all())
-        return inside and float(box_iou(pair[:1], pair[1:])) < SAME_BOX_OVERLAP
+        return float(box_iou(pair[:1], pair[1:])) if inside else 1.0
 
     def mask_crop(self, size: int, margin: float) -> Tensor | None:
         """(1, 1, size, size) of the mask, as the photograph is cropped to its box."""

@@ -301,8 +301,8 @@ def test_wrong_box_is_corrected():
     assert result.to_dict()["corrected_box"] == result.corrected_box.tolist()
 
 
-def registered_in_boxes(monkeypatch, *results):
-    """The answer in a wrong box, if registrations yield these results, and the boxes of all."""
+def registered_in_boxes(monkeypatch, *results, box=WRONG):
+    """The answer in a box, if registrations yield these results, and the boxes of all."""
     answers = iter(results)
     boxes = []
 
@@ -311,7 +311,7 @@ def registered_in_boxes(monkeypatch, *results):
         return [next(answers) for _ in items]
 
     monkeypatch.setattr(stages, "register_boxes", register_boxes)
-    return answer_of(truck_registrar(), IMAGE, WRONG), boxes
+    return answer_of(truck_registrar(), IMAGE, box), boxes
 
 
 def plain_result():
@@ -348,8 +348,9 @@ def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, confi
     assert len(boxes) == 2
 
 
-def test_only_doubtful_photographs_are_registered_again(monkeypatch):
-    """In the box around the best pose, then in that around the second, each box once."""
+def test_doubtful_photographs_are_registered_again(monkeypatch):
+    """In the box around the best pose, then in that around the second, each box once; of a reliable
+    answer, in the first, if it is far from the given one."""
     one = plain_result()
     sure = replace(one, probabilities=(one.reliable_from,))
     doubtful = replace(one, probabilities=(one.reliable_from - 0.01,))
@@ -359,8 +360,11 @@ def test_only_doubtful_photographs_are_registered_again(monkeypatch):
     nearer[2, 3] = -0.1 * float(T[2, 3])
     other = replace(right, projection=(nearer @ T, K))
     two = replace(doubtful, hypotheses=(right, other), probabilities=(0.5, 0.3))
-    assert len(registered_in_boxes(monkeypatch, sure)[1]) == 1
-    assert len(registered_in_boxes(monkeypatch, doubtful, sure)[1]) == 2
+    rough = BOX + torch.tensor([-0.04, 0.0, 0.0, 0.0]) * (BOX[2] - BOX[0])
+    assert len(registered_in_boxes(monkeypatch, sure, box=rough)[1]) == 1
+    assert len(registered_in_boxes(monkeypatch, doubtful, sure, box=rough)[1]) == 2
+    far = replace(two, probabilities=sure.probabilities)
+    assert len(registered_in_boxes(monkeypatch, far, sure)[1]) == 2
     assert len(registered_in_boxes(monkeypatch, two, sure)[1]) == 2
     result, boxes = registered_in_boxes(monkeypatch, two, doubtful, sure)
     given, first, second = (double(box) for box in boxes)
@@ -431,14 +435,14 @@ def test_check_crop_refuses_any_single_colour():
 def test_boxes_are_compared_inside_the_photograph():
     for size, given, box, expected in (
         # cut off by the right border
-        ((100, 200), (150.0, 20.0, 199.5, 80.0), (150.0, 20.0, 260.0, 80.0), False),
-        ((100, 200), (150.0, 20.0, 199.5, 80.0), (130.0, 20.0, 240.0, 80.0), True),
-        ((80, 120), (0.0, 10.0, 100.0, 60.0), (12.0, 10.0, 112.0, 60.0), True),  # IoU 0.79
+        ((100, 200), (150.0, 20.0, 199.5, 80.0), (150.0, 20.0, 260.0, 80.0), 1.0),
+        ((100, 200), (150.0, 20.0, 199.5, 80.0), (130.0, 20.0, 240.0, 80.0), 0.71),
+        ((80, 120), (0.0, 10.0, 100.0, 60.0), (12.0, 10.0, 112.0, 60.0), 0.79),
         # outside: not used
-        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),
+        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), 1.0),
     ):
         item = Photograph(torch.zeros(3, *size), torch.tensor(given), Camera(CAMERA))
-        assert item.shows_other_part(double(box)) == expected
+        assert item.overlap(double(box)) == pytest.approx(expected, abs=0.005)
 
 
 def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
