@@ -16,7 +16,7 @@ from curvireg_torch.geometry.framing import (
 )
 from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.registration.rig import RigPhotograph
-from curvireg_torch.registration.stages import _other_box, describe, rank
+from curvireg_torch.registration.stages import _in_box_of_pose, describe, rank
 from tests._support import CAMERA, SIZE, answer_of, double, errors, eye, learned_registrar, scene
 
 
@@ -79,8 +79,8 @@ def test_a_hidden_half_needs_a_box_that_is_said_to_be_visible(seed):
     result = answer_of(visible_registrar(), image, box)
     assert errors(result, T)[0] < 10.0
     item = as_photograph(image, box, CAMERA)
-    assert _other_box(visible_registrar(), item, result) is None
-    assert _other_box(learned_registrar(), item, result) is not None
+    assert _in_box_of_pose(visible_registrar(), [item], result, 0, 0.85) is None
+    assert _in_box_of_pose(learned_registrar(), [item], result, 0, 0.85) is not None
     as_whole = answer_of(learned_registrar(), image, box)
     assert errors(as_whole, T)[0] > 15.0
     assert not as_whole.reliable
