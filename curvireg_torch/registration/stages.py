@@ -60,11 +60,13 @@ BLOCK = {"cpu": 16}
 Measured on a CPU, 16 photographs of one mesh: blocks of 16 take 9 to 12 % less processor time than
 blocks of 8, and 4 to 8 % more memory (1.14 GB at 640 x 480, 1.71 GB at 4000 x 3000)."""
 BLOCK_OF_DEVICE = 64
-SAME_BOX_OVERLAP = 0.98  # (IoU) from which two boxes count as the same
-# The same of a photograph whose answer is reliable, by the box around the best pose and around the
-# second: boxes drawn by hand had at least 0.86 with the first on 60 generated photographs
+# Overlap (IoU) with a box that was tried, from which the box around a pose is not: of doubtful
+# answers; of reliable ones, for the best pose and the second. On 60 generated photographs boxes
+# drawn by hand overlapped that around the best pose by at least 0.86
+SAME_BOX_OVERLAP = 0.98
 RELIABLE_OVERLAPS = (0.85, 0.0)
-LEAST_CONFIDENCE = 0.005  # from where, and up to 1 minus which, confidences of boxes are compared
+# Confidences below it, or above 1 minus it, do not tell which of two boxes is right
+LEAST_CONFIDENCE = 0.005
 VIEWS_OF_HIDDEN = 4  # best views that are tried in each box of an object behind an occluder
 
 
