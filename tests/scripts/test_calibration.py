@@ -131,7 +131,7 @@ def test_level_of_few_rows_keeps_the_proportions_of_the_weights():
 
 def test_grey_meshes_have_no_colours(tmp_path):
     path = tmp_path / "painted.glb"
-    example_mesh(painted=True).export(path)
+    example_mesh(painted=True).apply_scale(1000.0).export(path)  # in mm
     assert measure.mesh_of(path, grey=False).has_colours
     assert not measure.mesh_of(path, grey=True).has_colours
     assert measure.is_grey("shelves", 4)
