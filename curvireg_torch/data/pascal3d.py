@@ -7,9 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Unpack
 
-from PIL import Image
-
-from ..errors import InvalidInputError, MissingFileError
+from ..errors import CurviregError, InvalidInputError, MissingFileError
+from ..formats.pictures import picture_size
 from ..utils.aliases import PathName
 from ..utils.checks import check_option
 from ..utils.files import finite_numbers
@@ -214,8 +213,9 @@ def _is_resized(image: Path, record: Any) -> bool:
     """Whether a photograph has another size than its annotation states; a file that cannot be read
     says so when its pixels are."""
     stated = record[0].get("imgsize")
-    with suppress(Exception), Image.open(image) as file:  # Pillow raises errors of any kind
-        return isinstance(stated, list) and stated[:2] != list(file.size)
+    with suppress(CurviregError):
+        height, width = picture_size(image).shown
+        return isinstance(stated, list) and stated[:2] != [width, height]
     return False
 
 
