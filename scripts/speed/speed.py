@@ -104,7 +104,8 @@ def measure(step: str, folder: str, photographs: int) -> dict[str, float]:
         return timed(lambda mesh: cr.ViewBank.build(mesh, progress=False), [mesh])
     K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
     paths = [str(Path(folder, f"photo{k}.png")) for k in range(EARLIER + photographs)]
-    boxes = torch.tensor(_shared.read_json(Path(folder, "boxes.json")))
+    # not by _shared, which is the other checkout's here
+    boxes = torch.tensor(json.loads(Path(folder, "boxes.json").read_text("utf-8")))
     registrar = cr.Registrar(mesh, progress=False)
     if step == "follow":
         from curvireg_torch.data import read_image
