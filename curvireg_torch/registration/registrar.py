@@ -25,7 +25,7 @@ from .photograph import OnDemand, Photograph, as_photographs
 from .refinement import refine
 from .result import FailedRegistration, Registration, Results
 from .several import register_views
-from .stages import Items, register_block, register_photographs, share_of_worker
+from .stages import Items, register_photographs, share_of_worker
 from .target import Target
 
 __all__ = ["Registrar"]
@@ -199,8 +199,8 @@ class Registrar(Target):
         """
         if self.workers is not None and len(items) > 1:
             return _register_by_workers(self, self.workers, items, detects=detects)
-        in_block = _detected if detects else register_block
-        return register_photographs(self, items, self.others, in_block=in_block)
+        detect = _detected if detects else None
+        return register_photographs(self, items, self.others, detect=detect)
 
     def of_mesh(self, mesh_index: int) -> "Registrar":
         """Return the registrar of one of several meshes, by :attr:`Registration.mesh_index`."""

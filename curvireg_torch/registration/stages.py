@@ -1,7 +1,7 @@
 """A registration, stage by stage, each for a block of photographs at once: describe, rank, start,
 screen, fit, refit, judge."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -94,10 +94,11 @@ def blocks_of(items: Items, device: str) -> Iterator[tuple[int, Items]]:
         yield first, [items[k] for k in range(first, min(first + size, len(items)))]
 
 
-def register_block(target: Target, items: Items, first: int) -> Results:
-    """Register a few photographs with boxes; the ``first`` one's index is that of the caller."""
+def _register_block(target: Target, items: Items, first: int) -> Results:
+    """Register a few photographs in their boxes; the ``first`` one's index is that of the
+    caller."""
     results: Results = []
-    registered = _with_corrected_boxes(target, items, register_boxes(target, items))
+    registered = register_boxes(target, items)
     for index, (item, result) in enumerate(zip(items, registered, strict=True), first):
         if isinstance(item, CurviregError):
             results.append(FailedRegistration(item))
@@ -113,19 +114,50 @@ def register_photographs(
     items: Items,
     others: Sequence[Target] = (),
     *,
-    in_block: Callable[[Target, Items, int], Results] = register_block,
+    detect: Callable[[Target, Items, int], Results] | None = None,
 ) -> Results:
-    """Register photographs in blocks, by default in their boxes, each to the best of the target and
-    ``others``; one that cannot be registered fails alone."""
+    """Register photographs in blocks, each to the best of the target and ``others``; one that
+    cannot be registered fails alone. Boxes are corrected, unless ``detect`` searches for the
+    object: in a few photographs, the first of which has an index."""
     results: Results = []
     meshes = (target, *others)
+    in_block = detect or _register_block
     with exact_convolutions():
         for first, some in blocks_of(items, target.bank.device.type):
             of_meshes = [in_block(mesh, some, first) for mesh in meshes]
-            for item, found in zip(some, zip(*of_meshes, strict=True), strict=True):
-                given = item if isinstance(item, Photograph) else None
-                results.append(best_of_meshes(found, meshes, given))
+            best = _best_of_each(of_meshes, meshes, some)
+            if detect is None:
+                corrected = _with_best_corrected(of_meshes, best, meshes, some)
+                best = _best_of_each(corrected, meshes, some)
+            results += best
     return results
+
+
+def _best_of_each(of_meshes: Sequence[Results], meshes: Sequence[Target], items: Items) -> Results:
+    """The best of the results of several meshes for each photograph."""
+    return [
+        best_of_meshes(found, meshes, item if isinstance(item, Photograph) else None)
+        for item, found in zip(items, zip(*of_meshes, strict=True), strict=True)
+    ]
+
+
+def _with_best_corrected(
+    of_meshes: Sequence[Results], best: Results, meshes: Sequence[Target], items: Items
+) -> list[Results]:
+    """The results of several meshes, in corrected boxes where a mesh is the best one of a
+    photograph: with wrong meshes nearly all answers are doubtful."""
+    corrected = []
+    for number, (mesh, results) in enumerate(zip(meshes, of_meshes, strict=True)):
+        chosen = {
+            k: result
+            for k, (result, one) in enumerate(zip(results, best, strict=True))
+            if isinstance(result, Registration)
+            and isinstance(one, Registration)
+            and one.mesh_index == number
+        }
+        again = _in_corrected_boxes(mesh, items, chosen)
+        corrected.append([again.get(k, result) for k, result in enumerate(results)])
+    return corrected
 
 
 def failure(error: CurviregError, index: int) -> FailedRegistration:
@@ -133,11 +165,12 @@ def failure(error: CurviregError, index: int) -> FailedRegistration:
     return FailedRegistration(error.with_subject("").of_image(index))
 
 
-def _with_corrected_boxes(target: Target, items: Items, results: Sequence[Result]) -> list[Result]:
-    """Results; a photograph that is doubtful, or whose box is far from that around its pose, is
-    registered again in the latter, and if it is doubtful still, in that around the second pose.
-    What agrees best with it stands."""
-    first = {k: result for k, result in enumerate(results) if isinstance(result, Registration)}
+def _in_corrected_boxes(
+    target: Target, items: Items, first: Mapping[int, Registration]
+) -> dict[int, Registration]:
+    """The ``first`` results of some photographs, by their numbers. One that is doubtful, or whose
+    box is far from that around its pose, is registered again in the latter, and if it is doubtful
+    still, in that around the second pose. What agrees best with it stands."""
     best = dict(first)
     tried = {k: [item] for k, item in enumerate(items) if isinstance(item, Photograph)}
     weights = target.score_weights(exact=True)
@@ -155,7 +188,7 @@ def _with_corrected_boxes(target: Target, items: Items, results: Sequence[Result
                 continue
             if _agreement(other, weights) > _agreement(best[k], weights):
                 best[k] = replace(other, corrected_box=item.box.double())
-    return [best.get(k, result) for k, result in enumerate(results)]
+    return best
 
 
 def _agreement(result: Registration, weights: EvidenceWeights) -> float:

@@ -11,7 +11,7 @@ import trimesh
 from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.fitting.details import ContourDetails
-from curvireg_torch.registration import FailedRegistration, judging
+from curvireg_torch.registration import FailedRegistration, judging, stages
 from curvireg_torch.registration.judging import best_of_meshes, joined
 from tests._support import CAMERA, learned_registrar, slow_after
 from tests._support.results import registration
@@ -140,3 +140,26 @@ def test_details_of_meshes_with_fewer_points_are_filled_with_invalid_ones():
     both = joined([details(3), details(5)])
     assert both.uv.shape == (2, 5, 2)
     assert both.valid.sum(dim=1).tolist() == [3, 5]
+
+
+@pytest.mark.parametrize("best", [0, 1])
+def test_boxes_are_corrected_for_the_best_mesh_alone(monkeypatch, best):
+    registrar = Registrar([bank(), bank()])
+    image, box, _ = photograph(truck(), 35.0, 25.0, 0)
+    rough = box - torch.tensor([0.1, 0.0, 0.0, 0.0]) * (box[2] - box[0])
+    (one,) = Registrar(bank())([image], box[None], CAMERA)
+    first = one.hypotheses[0]
+    registered = []
+
+    def register_boxes(target, items):
+        is_best = (target is registrar) == (best == 0)
+        registered.extend(is_best for _ in items)
+        evidence = first.evidence | {"similarity": 0.9 if is_best else 0.1}
+        doubtful = replace(
+            one, hypotheses=(replace(first, evidence=evidence),), probabilities=(0.4,)
+        )
+        return [doubtful for _ in items]
+
+    monkeypatch.setattr(stages, "register_boxes", register_boxes)
+    assert registrar([image], rough[None], CAMERA)[0].mesh_index == best
+    assert registered == [best == 0, best == 1, True]
