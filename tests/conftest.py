@@ -12,21 +12,23 @@ import pytest
 import torch
 
 from curvireg_torch import ViewBank, sample_views, synthetic
-from curvireg_torch.data import BOPDataset, Pascal3DPlus, PoseFolder
+from curvireg_torch.data import BOPDataset, Pascal3DPlus, PoseFolder, mat_files
 from curvireg_torch.synthetic import example_mesh
 from tests._support import scenes
 from tests._support.miniature import write_bop, write_pascal3d, write_web
+from tests._support.programs import run_here
 
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_collection():
     """The modules of a session stay: they are not searched for cycles while they are loaded, nor
-    where the code under test asks for it. Examples draw the scene of the demo once."""
+    where the code under test asks for it. Scenes of the demo are drawn once."""
     gc.disable()
     yield
     gc.freeze()
     gc.enable()
-    synthetic.demo_scene = cache(synthetic.demo_scene)
+    scene_of = cache(synthetic.demo_scene)
+    synthetic.demo_scene = lambda seed=2: scene_of(seed)
 
 
 def pytest_collection_modifyitems(config, items):
@@ -71,8 +73,16 @@ def threads():
 
 
 @pytest.fixture
-def pascal(tmp_path):
-    """Five objects, of which one has a damaged photograph and one a damaged CAD."""
+def mats_here(monkeypatch):
+    """MATLAB files are read in this process."""
+    monkeypatch.setattr(mat_files, "run_program", run_here)
+
+
+@pytest.fixture
+def pascal(tmp_path, monkeypatch):
+    """Five objects, of which one has a damaged photograph and one a damaged CAD; MATLAB files are
+    read in this process."""
+    monkeypatch.setattr(mat_files, "run_program", run_here)
     root = tmp_path / "pascal"
     write_pascal3d(root)
     photograph = root / "Images" / "car_pascal" / "2008_000003.jpg"

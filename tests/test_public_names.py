@@ -28,7 +28,10 @@ def imported(tree, module, *, is_package):
     """The (module, name) pairs of ``from module import name``, relative ones made absolute."""
     here = module.split(".")
     pairs = []
-    for node in ast.walk(tree):
+    nodes = [tree]
+    for node in nodes:  # statements alone: expressions, which are more, import nothing
+        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+            nodes += getattr(node, part, [])
         if isinstance(node, ast.ImportFrom):
             above = here[: len(here) - node.level + is_package] if node.level else []
             source = ".".join([*above, *([node.module] if node.module else [])])

@@ -1,15 +1,31 @@
 import json
 
+import numpy as np
 import pytest
 
 from curvireg_torch.cli import main
+from curvireg_torch.jobs import result_files
 from tests._support.lists import box_of, write_files
+
+PICTURE = np.zeros((8, 8, 3), np.uint8)
 
 
 @pytest.fixture(scope="package")
 def folder(tmp_path_factory):
     """Photographs, a mesh and a bank on disk, see :func:`write_files`."""
     return write_files(tmp_path_factory.mktemp("cli"))
+
+
+@pytest.fixture(autouse=True)
+def _overlay(request, monkeypatch):
+    """It takes as long as a registration: it is drawn where a test asks for ``drawn``."""
+    if "drawn" not in request.fixturenames:
+        monkeypatch.setattr(result_files, "registration_sheet", lambda *_, **__: PICTURE)
+
+
+@pytest.fixture
+def drawn():
+    """The overlay is drawn."""
 
 
 @pytest.fixture

@@ -8,13 +8,14 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import pytest
 import torch
 import trimesh
 
-from curvireg_torch import __main__
+from curvireg_torch import __main__, cli
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregWarning
 from curvireg_torch.geometry import rotation_error
@@ -119,6 +120,7 @@ def test_main_prints_our_warnings_and_not_those_of_numpy(monkeypatch, capsys):
     assert capsys.readouterr().err == "curvireg: warning: of ours\n"
 
 
+@pytest.mark.usefixtures("drawn")
 def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
     """The true pose projects the mesh into the box, and the errors are those of the result."""
     options = {}
@@ -163,6 +165,7 @@ def test_plot_draws_a_registration(folder, tmp_path, monkeypatch, kind):
 def test_wrong_inputs_are_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(PRESETS, DEFAULT, SMALL)
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(cli, "build_parser", cache(cli.build_parser))
     monkeypatch.chdir(tmp_path)
     wrong = []
     for line, expected in cases(tmp_path):

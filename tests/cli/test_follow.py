@@ -34,18 +34,23 @@ def frames(tmp_path_factory):
     write_video(folder / "turn.avi", images, rate=25.0)
     with_exif(folder / "shots" / "0.png", exif(1, 38))
     (folder / "shots" / "3.png").write_bytes(b"no photograph")
+    T = scenes[0][2]
+    start = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}
+    (folder / "start.json").write_text(json.dumps(start))
     return folder, scenes
 
 
 @pytest.fixture
 def follow(frames):
-    """Run ``curvireg follow``, by default on the folder, with the box of the first frame."""
+    """Run ``curvireg follow``, by default on the folder, with the box of the first frame, or from
+    its pose, which is quicker."""
     folder, scenes = frames
 
-    def run(*options, source="shots", box=True):
+    def run(*options, source="shots", box=True, start=False):
         source = str(folder / source) if (folder / source).exists() else source
-        boxes = ["--box", *map(str, scenes[0][1].tolist())] if box else []
-        words = ["follow", source, str(folder / "truck.safetensors"), "--quiet", *boxes]
+        place = ["--box", *map(str, scenes[0][1].tolist())] if box else []
+        place = ["--start", str(folder / "start.json")] if start else place
+        words = ["follow", source, str(folder / "truck.safetensors"), "--quiet", *place]
         return main([*words, *map(str, options)])
 
     return run
@@ -172,7 +177,7 @@ def test_follow_live_drops_frames_that_are_late(frames, follow, tmp_path, monkey
         return capture(file)
 
     monkeypatch.setattr(cv2, "VideoCapture", open_capture)
-    assert follow("--camera", *CAMERA, "--out", tmp_path, source=source) == 0
+    assert follow("--camera", *CAMERA, "--out", tmp_path, source=source, start=True) == 0
     assert opened == [0 if source == "0" else source]
     names = [row["photo"] for row in table(tmp_path)]
     assert len(names) < 3
@@ -283,7 +288,7 @@ def test_follow_keeps_the_poses_before_an_interruption(
     if source == "0":
         monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture(file))
     monkeypatch.setattr(OverlayVideo, "add", interrupted)
-    assert follow("--camera", *CAMERA, "--out", tmp_path, source=source) == code
+    assert follow("--camera", *CAMERA, "--out", tmp_path, source=source, start=True) == code
     verdicts = [row["verdict"] for row in table(tmp_path)]
     if source == "0":
         assert verdicts == ["reliable"]
@@ -310,7 +315,7 @@ def test_follow_keeps_no_pose_in_memory_and_writes_each_at_once(follow, tmp_path
     assert str(tally).startswith(
         "1000 frames: 1000 reliable, 0 unsure, 0 no match, 0 lost, 0 failed, 2.0 frames per"
     )
-    assert follow("--camera", *CAMERA, "--out", tmp_path) == 0
+    assert follow("--camera", *CAMERA, "--out", tmp_path, start=True) == 0
     assert rows == [1, 2, 3, 4]
 
 

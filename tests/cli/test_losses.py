@@ -105,7 +105,7 @@ def test_demo_plot_and_bank_overwrite_no_file_of_others(folder, refused, tmp_pat
     for name in ("plot.png", "plot.svg"):
         refused(run("plot overlay", *files, out=name), f"{name}: exists")
     for _ in range(2):
-        assert run("plot viewpoints", *files, out="mine.png") == 0
+        assert run("plot viewpoints", *files, "--mesh-is", "similar", out="mine.png") == 0
     refused(run("plot overlay", *files[:2], out="shot.png"), "shot.png: an input")
     refused(run("bank", folder / "truck.ply", out="bank.safetensors"), "bank.safetensors: exists")
     assert {path.read_text() for path in tmp_path.glob("[bp]*") if path.name != "mine.png"} == {

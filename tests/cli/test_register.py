@@ -19,6 +19,7 @@ from tests._support import bank_of, double, scene, slow_after, truck_bank
 from tests._support.lists import CAMERA, box_of, check_pose
 
 
+@pytest.mark.usefixtures("drawn")
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
     assert register_one("--camera", *CAMERA, "--hypotheses", "3", mesh="learned.safetensors") == 0
     result = document()

@@ -18,6 +18,8 @@ from curvireg_torch.geometry.crops import crop_images
 from tests._support import refused
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
+pytestmark = pytest.mark.usefixtures("mats_here")
+
 
 @pytest.fixture(params=["pascal", "bop", "web"])
 def dataset(request, tmp_path):

@@ -3,7 +3,6 @@ import struct
 import zlib
 
 import numpy as np
-import pytest
 import scipy.io
 
 from curvireg_torch.data.mat_files import read_mats
@@ -34,17 +33,18 @@ def read(path, variable="record"):
     return value
 
 
-@pytest.mark.parametrize("compress", [False, True])
-def test_values_are_plain_numbers_texts_and_structs(tmp_path, compress):
+def test_values_are_plain_numbers_texts_and_structs(tmp_path):
     types = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
     structs = np.empty((1, 2), dtype=[("a", object), ("b", object)])
     structs[0, 0], structs[0, 1] = ("x", np.eye(2)), ("", np.empty((0, 0)))
     record = {f"n_{kind}": np.array([[1, 2, 3], [4, 5, 100]], kind) for kind in types}
     record |= {"text": "car äβ", "flag": True, "structs": structs, "unknown": np.nan}
     record |= {"complex": np.array([1j]), "cell": np.array([1, "a"], dtype=object)}
-    path = tmp_path / "a.mat"
-    scipy.io.savemat(path, {"other": 1.0, "record": record}, do_compression=compress)
-    (ours,) = read(path)
+    paths = [tmp_path / "a.mat", tmp_path / "b.mat"]
+    for path, compress in zip(paths, (False, True), strict=True):
+        scipy.io.savemat(path, {"other": 1.0, "record": record}, do_compression=compress)
+    (ours,), (compressed,) = read_mats(paths, "record")
+    assert str(ours) == str(compressed)
     for kind in types:
         assert ours[f"n_{kind}"] == [1, 4, 2, 5, 3, 100], "by columns"
     assert (ours["text"], ours["flag"], ours["complex"], ours["cell"]) == (

@@ -8,6 +8,8 @@ from curvireg_torch.errors import ImageError, InvalidInputError, MissingFileErro
 from curvireg_torch.geometry import rotation_from_viewpoint
 from tests._support.miniature import pascal_object, write_image, write_pascal3d, write_record
 
+pytestmark = pytest.mark.usefixtures("mats_here")
+
 
 @pytest.fixture
 def tree(tmp_path):

@@ -38,10 +38,10 @@ def post(address, name, content):
         return answer.status
 
 
+@pytest.mark.slow  # tests/viewer/test_server.py ends one by SIGINT
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 @pytest.mark.parametrize(
-    ("host", "number"),
-    [("::1", signal.SIGHUP), pytest.param("127.0.0.1", signal.SIGTERM, marks=pytest.mark.slow)],
+    ("host", "number"), [("::1", signal.SIGHUP), ("127.0.0.1", signal.SIGTERM)]
 )
 def test_a_signal_removes_the_uploads_and_no_program_is_told_the_address(tmp_path, host, number):
     browser = tmp_path / "browser"

@@ -1,28 +1,20 @@
 """What tests of meshes share."""
 
-import runpy
-import sys
-
 import pytest
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import cad, usd
 from tests._support.meshes import load as load
+from tests._support.programs import run_here
 from tests.formats.meshes.packages import threemf
 
 
 @pytest.fixture
 def here(monkeypatch):
-    """OpenUSD and OpenCascade read in this process: one of their own takes a second to start."""
-
-    def run(program, arguments, **_):
-        monkeypatch.setattr(sys, "argv", [str(program), *arguments])
-        runpy.run_path(str(program), run_name="__main__")
-        return True
-
+    """OpenUSD and OpenCascade read in this process."""
     for module in (cad, usd):
-        monkeypatch.setattr(module, "run_program", run)
+        monkeypatch.setattr(module, "run_program", run_here)
 
 
 @pytest.fixture

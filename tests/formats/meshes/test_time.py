@@ -45,4 +45,4 @@ def test_time_grows_with_the_size(write, load, name):
     if suffix == "stl":
         with refused("cut short", MeshError):
             load(written(100))
-    check_linear(load, written, 5_000)
+    check_linear(load, written, 1_000 if name == "obj libraries" else 5_000)  # each is looked for
