@@ -12,6 +12,7 @@ from tests._support.scenes import (
     bytes_bgr,
     degrees_off,
     errors,
+    exact_registrar,
     found_in,
     learned_registrar,
     scene,

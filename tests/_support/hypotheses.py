@@ -10,10 +10,21 @@ from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support.numbers import double
 from tests._support.scenes import CAMERA
 
+HALF_TURN = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
+"""Of the model, about its vertical axis."""
+
 
 def turned(*degrees):
     """(N, 3, 3) rotations of views about the vertical axis."""
     return torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in degrees])
+
+
+def placed_at(T, centre, K=CAMERA, photograph=None):
+    """The poses T (N, 4, 4) of view 0 in one camera."""
+    nothing = torch.zeros(len(T))
+    cameras = K.expand(len(T), 3, 3)
+    view = nothing.long()
+    return Hypotheses.at(T, cameras, centre, view, nothing.double(), photograph)
 
 
 def poses_at(*degrees, x=0.0, centre=(0.0, 0.0, 0.0)):

@@ -31,9 +31,10 @@ def truck_bank():
 
 @cache
 def learned_registrar():
-    """A registrar of the truck with the default pipeline, whose results have a confidence."""
+    """A registrar of the truck with the default pipeline, whose results have a confidence, and
+    exact boxes."""
     views = sample_views(azimuth_step=15, elevations=[0, 20, 40, 60])
-    return Registrar(bank_of(example_mesh(), views, image_size=96))
+    return exact_registrar(bank_of(example_mesh(), views, image_size=96))
 
 
 @cache
@@ -93,9 +94,17 @@ def unrefined(bank, **changes):
     return replace(bank.pipeline, search=False, contours=False, **changes)
 
 
+def exact_registrar(bank, **options):
+    """A registrar of exact boxes, in which photographs are registered once."""
+    return Registrar(bank, pipeline=replace(bank.pipeline, box_jitter=0.0), **options)
+
+
 def truck_registrar(**changes):
-    """A registrar of the truck, with changed fields of its pipeline."""
-    return Registrar(truck_bank(), pipeline=replace(truck_bank().pipeline, **changes))
+    """A registrar of the truck in exact boxes, with changed fields of its pipeline."""
+    exact = exact_registrar(truck_bank())
+    return (
+        Registrar(truck_bank(), pipeline=replace(exact.pipeline, **changes)) if changes else exact
+    )
 
 
 def bytes_bgr(image):

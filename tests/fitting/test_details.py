@@ -15,8 +15,7 @@ from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import synthesize_photograph
 from tests._support import CAMERA, SIZE, double, eye, seeded
-
-TURN = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
+from tests._support.hypotheses import HALF_TURN
 
 
 @cache
@@ -40,7 +39,7 @@ def compared(*, unit=1.0, wrong=0.0):
     crops = EdgeCrops.cut([image], box[None], 0.1)
     again = T.clone()
     again[0, 3] += wrong * radius
-    poses = torch.stack([T, T @ TURN, again])
+    poses = torch.stack([T, T @ HALF_TURN, again])
     index = torch.zeros(3, dtype=torch.long)
     K = CAMERA.expand(3, 3, 3)
     return details.compare_details(MeshContours(mesh), crops, K, poses, index)

@@ -24,7 +24,15 @@ from curvireg_torch.registration.hypotheses import fit_poses, placed
 from curvireg_torch.registration.photograph import as_photographs
 from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background
-from tests._support import degrees_off, double, eye, seeded, slow_after
+from tests._support import (
+    bank_of,
+    degrees_off,
+    double,
+    exact_registrar,
+    eye,
+    seeded,
+    slow_after,
+)
 
 SIZE = (360, 480)
 K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
@@ -64,7 +72,7 @@ def keypoints():
 
 def registrar_of(**views):
     """One of the carton; its keypoints, which take seconds, are those above."""
-    made = cr.Registrar(mesh(), views=cr.sample_views(**views), mesh_is="exact")
+    made = exact_registrar(bank_of(mesh(), cr.sample_views(**views)), mesh_is="exact")
     made._keypoints = keypoints()
     return made
 

@@ -27,7 +27,7 @@ from curvireg_torch.mesh.mesh import extreme_points, mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.contours import MeshContours
-from tests._support import CAMERA, double, slow_after
+from tests._support import CAMERA, bank_of, double, exact_registrar, slow_after
 from tests._support.cans import can, photograph
 
 MESH = can()
@@ -156,9 +156,8 @@ def test_fit_must_find_enough_corners_and_more_than_the_start(
 def test_label_does_not_pull_a_pose_out_of_its_limits(monkeypatch):
     """They are 10 degrees away from the true rotation; no keypoints help."""
     monkeypatch.setattr(cr.Registrar, "keypoint_matches", lambda *_: None)
-    registrar = cr.Registrar(
-        MESH, views=cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y")
-    )
+    views = cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y")
+    registrar = exact_registrar(bank_of(MESH, views))
     prior = cr.PosePrior(rotation=turned_can(16.0)[0, :3, :3], within=6.0)
     free, limited = (registrar([image()], BOX, CAMERA, prior=p)[0] for p in (None, prior))
     assert rotation_error(free.rotation, R) < 1.0

@@ -20,7 +20,7 @@ from curvireg_torch.matching.describe import view_mesh
 from curvireg_torch.mesh import MeshWarning, mesh_symmetries, reflections, symmetry
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.mesh.reflections import reflection_plane
-from curvireg_torch.pipeline import Pipeline, ViewPolicy
+from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Correlation
 from curvireg_torch.utils.files import tensor_checksum
@@ -307,8 +307,9 @@ def test_the_covariance_counts_a_picture_of_an_orthographic_camera_once(truck, c
     elevations = [0.0, 40.0]
     views = sample_views(azimuth_step=40.0, elevations=elevations, distances=[3.0, 5.0, 9.0])
     once = sample_views(azimuth_step=40.0, elevations=elevations, distances=[3.0])
-    bank = build(truck, views, camera=camera)
-    same = build(truck, once, camera=camera)
+    bank, same = (
+        build(truck, some, camera=camera, pipeline=PRESETS["classical"]) for some in (views, once)
+    )
     query = torch.rand(3, bank.descriptors.shape[1], generator=seeded(0))
     for name in ("precision", "whitening"):
         found = getattr(bank, name)(query)

@@ -16,9 +16,9 @@ from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewBank, bank_key, cache, cache_folder, cached_bank, list_cache
 from curvireg_torch.matching.cache import clear_cache
 from curvireg_torch.mesh.mesh import as_mesh
-from curvireg_torch.pipeline import BankSettings, Pipeline
+from curvireg_torch.pipeline import PRESETS, BankSettings
 
-PIPELINE = Pipeline(bank=BankSettings(image_size=64))
+PIPELINE = replace(PRESETS["classical"], bank=BankSettings(image_size=64))  # quickly built
 VIEWS = sample_views(azimuth_step=90, elevations=[20])
 
 
@@ -54,7 +54,7 @@ def test_bank_key_depends_on_everything(monkeypatch):
     meshes += [textured(), textured(uv=1e-4), textured(level=1), textured(side=8), textured(side=2)]
     keys = [key(m) for m in meshes]
     keys += [key(mesh, VIEWS[:3]), key(mesh, renderer="embree")]
-    keys += [key(mesh, pipeline=Pipeline(bank=replace(PIPELINE.bank, sigma=1.5)))]
+    keys += [key(mesh, pipeline=replace(PIPELINE, bank=replace(PIPELINE.bank, sigma=1.5)))]
     assert key(textured().copy()) in keys
     monkeypatch.setattr(cache, "package_digest", lambda **_: "another version")
     keys.append(key(mesh))

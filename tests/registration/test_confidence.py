@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
+from curvireg_torch import Pipeline, Registrar, rotation_error, sample_views
 from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.measured_fit import contour_support
@@ -19,7 +19,9 @@ from tests._support import (
     CAMERA,
     SIZE,
     answer_of,
+    bank_of,
     double,
+    exact_registrar,
     learned_registrar,
     scene,
     seeded,
@@ -200,7 +202,7 @@ def test_confidence_is_that_of_the_reported_features(seed, camera):
     registrar = (
         learned_registrar()
         if camera is not None
-        else Registrar(learned_registrar().bank, mesh_is="similar")
+        else exact_registrar(learned_registrar().bank, mesh_is="similar")
     )
     result = registrar([image], box[None], camera)[0]
     any_right = confidence.probability_of_any(result.confidence_features, exact=camera is not None)
@@ -242,8 +244,9 @@ def test_confidence_is_higher_for_the_object_than_for_clutter(count):
 @pytest.mark.parametrize("seed", slow_after(1, range(3)))
 def test_confidence_does_not_depend_on_the_number_of_reported_hypotheses(seed):
     image, box, _ = scene(seed)
-    bank = learned_registrar().bank
-    registrars = (Registrar(bank, pipeline=replace(bank.pipeline, hypotheses=n)) for n in (1, 2))
+    known = learned_registrar()
+    few = (replace(known.pipeline, hypotheses=count) for count in (1, 2))
+    registrars = (Registrar(known.bank, pipeline=pipeline) for pipeline in few)
     one, two = (answer_of(registrar, image, box) for registrar in registrars)
     assert (len(one.hypotheses), len(two.hypotheses)) == (1, 2)
     assert torch.equal(one.rotation, two.rotation)
@@ -273,15 +276,13 @@ def test_evidence_is_measured_at_the_reported_pose(camera):
 
 def test_symmetries_of_the_shape_count_for_an_exact_mesh_only():
     views = sample_views(azimuth_step=45, elevations=[20])
-    cuboid = ViewBank.build(
-        trimesh.creation.box((1, 2, 3)), views, pipeline=PRESETS["classical"], progress=False
-    )
+    mesh = trimesh.creation.box((1, 2, 3))
+    cuboid = bank_of(mesh, views, pipeline=PRESETS["classical"], image_size=64)
     assert len(Registrar(cuboid).symmetries_of(exact=True)) == 4
     assert Registrar(cuboid).symmetries_of(exact=False) is None
     assert len(Registrar(cuboid, symmetries=torch.eye(4)[None]).symmetries_of(exact=True)) == 1
-    result = Registrar(cuboid)(torch.rand(1, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30]]), CAMERA)[
-        0
-    ]
+    image = torch.rand(3, 48, 64)
+    result = answer_of(exact_registrar(cuboid), image, torch.tensor([4.0, 4, 40, 30]))
     turned = (
         torch.stack([h.rotation for h in result.hypotheses])[:, None]
         @ mesh_symmetries(cuboid.mesh)[:, :3, :3]

@@ -11,8 +11,8 @@ from curvireg_torch.geometry.framing import CropFrame, photograph_box
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration.block import Described, counting_keypoints, evidence_of
-from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support import CAMERA, SIZE, double, eye, learned_registrar, scene
+from tests._support.hypotheses import HALF_TURN, placed_at
 
 
 def frame_of(target, box):
@@ -21,13 +21,27 @@ def frame_of(target, box):
     return CropFrame.of(box, shown, side=settings.image_size, margin=settings.margin)
 
 
+def described(target, T, *frames):
+    """A photograph in frames, whose descriptor is that of the pose T (4, 4) in the last one."""
+    (field,), _ = target.describer.seen_by(
+        T[None], (frames[-1].transform @ CAMERA)[None], shaded=False
+    )
+    count = len(frames)
+    return Described(
+        query=None,
+        rankings=[Ranking.none()] * count,
+        descriptor=target.describer.descriptor(field[None]).expand(count, -1),
+        crops=None,
+        keypoints=[None] * count,
+        frames=list(frames),
+    )
+
+
 @pytest.mark.parametrize(("chance", "expected"), [(2, [0.0, 0.0, 1.0, 20.0]), (0, [0, 2, 3, 22])])
 def test_keypoints_that_agree_by_chance_do_not_count(chance, expected):
     counts = double([0.0, 2.0, 3.0, 22.0])
     pipeline = Pipeline(fit=FitSettings(chance_keypoints=chance))
-    none = torch.zeros(4, dtype=torch.float64)
-    T = eye(4).repeat(4, 1, 1)
-    poses = Hypotheses.at(T, T[:, :3, :3], none[:3], none.long(), none)
+    poses = placed_at(eye(4).repeat(4, 1, 1), torch.zeros(3).double(), eye(3))
     described = SimpleNamespace(keypoints=[SimpleNamespace(agreeing=lambda *_: counts), None])
     target = SimpleNamespace(pipeline=pipeline)
     assert counting_keypoints(target, described, poses).tolist() == expected
@@ -38,20 +52,9 @@ def test_keypoints_that_agree_by_chance_do_not_count(chance, expected):
 def test_what_lies_outside_the_photograph_is_not_compared():
     target = learned_registrar()
     _, box, T = scene(0)
-    nothing = torch.zeros(1)
-    poses = Hypotheses.at(
-        T[None], CAMERA[None], target.describer.centre, nothing.long(), nothing.double()
-    )
-    frame = frame_of(target, box)
-    (field,), _ = target.describer.seen_by(T[None], (frame.transform @ CAMERA)[None], shaded=False)
-    photograph = Described(
-        query=None,
-        rankings=[Ranking.none()],
-        descriptor=target.describer.descriptor(field[None]),
-        crops=None,
-        keypoints=[None],
-        frames=[frame],
-    )
+    poses = placed_at(T[None], target.describer.centre)
+    photograph = described(target, T, frame_of(target, box))
+    (frame,) = photograph.frames
     assert float(evidence_of(target, photograph, poses).similarity) == pytest.approx(1.0)
     unseen = replace(frame, inside=torch.zeros_like(frame.inside))
     hidden = replace(photograph, frames=[unseen])
@@ -61,23 +64,9 @@ def test_what_lies_outside_the_photograph_is_not_compared():
 def test_poses_in_frames_and_poses_by_themselves_keep_their_order():
     target = learned_registrar()
     _, box, T = scene(0)
-    none = torch.zeros(4, dtype=torch.float64)
-    photograph = torch.tensor([1, 0, 1, 0])
-    turned = torch.stack([T, T, T @ torch.diag(double([-1.0, -1, 1, 1])), T])
-    poses = Hypotheses.at(
-        turned, CAMERA.expand(4, 3, 3), target.describer.centre, none.long(), none, photograph
-    )
-    frame = frame_of(target, box)
-    (field,), _ = target.describer.seen_by(T[None], (frame.transform @ CAMERA)[None], shaded=False)
-    descriptor = target.describer.descriptor(field[None]).expand(2, -1)
-    two = Described(
-        query=None,
-        rankings=[Ranking.none()] * 2,
-        descriptor=descriptor,
-        crops=None,
-        keypoints=[None] * 2,
-        frames=[None, frame],
-    )
+    turned = torch.stack([T, T, T @ HALF_TURN, T])
+    poses = placed_at(turned, target.describer.centre, photograph=torch.tensor([1, 0, 1, 0]))
+    two = described(target, T, None, frame_of(target, box))
     together = evidence_of(target, two, poses).similarity
     for row in range(4):
         alone = evidence_of(target, two, poses[row : row + 1]).similarity

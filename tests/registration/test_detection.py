@@ -89,7 +89,7 @@ def test_detected_pose_is_the_true_one(seed, corner, scale):
     K = CAMERA.clone()
     K[:2] *= scale
     K[:2, 2] += 0.5 * scale - 0.5 + torch.tensor(corner)
-    few = replace(bank().pipeline, detection=replace(FEW, proposals=8, min_size=0.1))
+    few = replace(bank().pipeline, detection=replace(FEW, min_size=0.1))
     result = cr.Registrar(bank(), pipeline=few)([image], camera_matrices=K)[0]
     assert (result.detection.box - box).abs().max() < 0.1 * (box[2:] - box[:2]).max()
     assert rotation_error(result.rotation, truth[:3, :3]) < 5

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
+from curvireg_torch import Pipeline, Registrar, rotation_error, sample_views
 from curvireg_torch.synthetic import example_mesh
-from tests._support import CAMERA, scene, unrefined
+from tests._support import CAMERA, bank_of, scene, unrefined
 
 IMAGES = [scene(seed)[0] for seed in (0, 1)]
 BOXES = torch.stack([scene(seed)[1] for seed in (0, 1)])
@@ -22,7 +22,7 @@ def bank():
     pipeline = replace(
         pipeline, hypotheses=2, detection=replace(pipeline.detection, views=12, proposals=4)
     )
-    return ViewBank.build(example_mesh(), views, pipeline=pipeline, progress=False)
+    return bank_of(example_mesh(), views, pipeline=pipeline, image_size=64)
 
 
 def numbers(result):

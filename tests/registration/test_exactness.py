@@ -10,9 +10,10 @@ from curvireg_torch.fitting.exactness import Exactness, exactness_of
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
 from curvireg_torch.geometry.cameras import rotation_towards
 from curvireg_torch.registration.camera import principal_covariance
-from curvireg_torch.registration.hypotheses import Hypotheses, placed
+from curvireg_torch.registration.hypotheses import placed
 from curvireg_torch.visualization.words import remarks
-from tests._support import CAMERA, double, eye, seeded
+from tests._support import double, eye, seeded
+from tests._support.hypotheses import placed_at
 from tests._support.results import registration
 
 COVARIANCE = torch.diag(double([0.02, 0.05, 0.03, 1.0, 2.0, 8.0]).square())
@@ -52,8 +53,7 @@ def test_a_principal_point_that_is_not_known_leaves_the_allocentric_rotation_exa
     T = eye(4)[None]
     T[0, :3, :3] = R
     T[0, :3, 3] = t
-    none = torch.zeros(1)
-    poses = placed(Hypotheses.at(T, CAMERA[None], CENTRE, none.long(), none.double()), T, CENTRE)
+    poses = placed(placed_at(T, CENTRE), T, CENTRE)
     unknown = principal_covariance(poses, (180, 240), CENTRE)[0]
     exactness = exactness_of(unknown, R, t, allocentric, distance)
     assert exactness.rotation_deg > 8.0

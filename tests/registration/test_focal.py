@@ -12,7 +12,7 @@ from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.geometry import Camera, axis_angle_from_rotation
 from curvireg_torch.geometry.cameras import point_in_cameras, rotation_towards
 from curvireg_torch.registration import camera as camera_module
-from curvireg_torch.registration.hypotheses import Hypotheses, projected_box
+from curvireg_torch.registration.hypotheses import projected_box
 from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support import (
@@ -25,6 +25,7 @@ from tests._support import (
     seeded,
     truck_registrar,
 )
+from tests._support.hypotheses import placed_at
 from tests.fitting.test_focal_length import NEAR, near_scene
 
 
@@ -32,10 +33,7 @@ def test_covariance_and_deviation_of_the_focal_length():
     image, box, T = near_scene()
     describer = truck_registrar().describer
     crops = EdgeCrops.cut([image], box[None], 0.1)
-    one = torch.zeros(1, dtype=torch.long)
-    poses = Hypotheses.at(
-        T[None], NEAR[None], describer.centre, one, torch.zeros(1, dtype=torch.float64)
-    )
+    poses = placed_at(T[None], describer.centre, NEAR)
     poses = replace(poses, covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
     item = as_photograph(image, box, Camera(NEAR, focal_deviation=0.05, source="exif"))
     covariance, deviation = camera_module.focal_covariance(describer, crops, poses, item)
@@ -95,8 +93,7 @@ def test_focal_lengths_with_small_deviations_are_right():
 def test_zoomed_poses_keep_their_images():
     T = near_scene()[2]
     describer = truck_registrar().describer
-    one = torch.zeros(1, dtype=torch.long)
-    poses = Hypotheses.at(T[None], NEAR[None], describer.centre, one, one.double())
+    poses = placed_at(T[None], describer.centre, NEAR)
     moved = camera_module.zoomed(poses, torch.tensor([2.0 * float(NEAR[0, 0])]), describer.centre)
     assert float(moved.cameras[0, 0, 0]) == pytest.approx(2.0 * float(NEAR[0, 0]))
     assert float(moved.distance[0]) > 1.9 * float(poses.distance[0])
@@ -130,8 +127,7 @@ def test_an_unknown_principal_point_moves_the_object_with_its_ray_and_keeps_its_
     size = (180, 240)
     centre = double([0.3, -0.2, 0.4])
     T = scene(0)[2][None].double()
-    none = torch.zeros(1)
-    pose = Hypotheses.at(T, CAMERA[None], centre, none.long(), none.double())
+    pose = placed_at(T, centre)
     covariance = camera_module.principal_covariance(pose, size, centre)[0]
     pixels = camera_module.PRINCIPAL_DEVIATION * 240
     moved_by = torch.zeros(6, 6, dtype=torch.float64)

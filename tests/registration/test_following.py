@@ -13,6 +13,7 @@ from curvireg_torch import Registrar
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import pose_around
+from curvireg_torch.pipeline import DetectionSettings
 from curvireg_torch.registration import FailedRegistration, Follower, refine, tracking
 from curvireg_torch.registration.tracking import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
@@ -28,7 +29,10 @@ from tests._support import (
     slow_after,
     truck_registrar,
 )
+from tests._support.hypotheses import HALF_TURN
+from tests._support.results import registration
 
+TRACKED = {"edge_support", "region", "flow", "keyframe"}
 LOST = Mock(side_effect=LostObjectError("lost"))
 
 
@@ -59,116 +63,84 @@ def test_follower_starts_from_a_known_pose_without_registering(monkeypatch):
         assert position < 0.02
         assert 0.5 < result.confidence <= 1.0
         assert torch.equal(result.transform[:3, 3], result.translation)
-        assert set(result.confidence_features) == {"edge_support", "region", "flow", "keyframe"}
+        assert set(result.confidence_features) == TRACKED
         json.dumps(result.to_dict(), allow_nan=False)
 
 
-def answering(monkeypatch, registrar, answers):
-    """Let the registrar give these confidences, one a call, for the true pose of the frame's
-    object."""
+def answer(T, confidence):
+    """A registration with this pose."""
+    made = registration(confidence=confidence)
+    first = replace(made.hypotheses[0], projection=(T, CAMERA))
+    return replace(made, hypotheses=(first, *made.hypotheses[1:]))
+
+
+def answering(monkeypatch, *answers):
+    """Let the registrar give these results, one a call."""
     given = iter(answers)
-    register = type(registrar).register_prepared
-
-    def call(self, items, **options):
-        found = register(self, items, **options)[0]
-        object.__setattr__(found, "probabilities", (next(given), 0.0))
-        return [found]
-
-    monkeypatch.setattr(type(registrar), "register_prepared", call)
-
-
-@pytest.mark.parametrize("first", slow_after(1, [BELIEVED_CONFIDENCE - 0.01, 0.015]))
-def test_a_pose_that_is_not_believed_is_not_followed(monkeypatch, first):
-    """It is registered again in the next frames, and no confidence rises by being followed."""
-    frames = sequence(4)
-    registrar = truck_registrar()
-    answering(monkeypatch, registrar, [first, first, 0.8])
-    follow = Follower(registrar, CAMERA)
-    results = [follow(image, box) for image, box, _ in frames]
-    assert [r.confidence for r in results[:3]] == [first, first, 0.8]
-    assert set(results[3].confidence_features) == {"edge_support", "region", "flow", "keyframe"}, (
-        "tracked"
-    )
-    assert results[3].confidence <= 0.8
+    monkeypatch.setattr(Registrar, "register_prepared", lambda *_, **__: [next(given)])
 
 
 @pytest.mark.parametrize(
-    ("answers", "follows"), [([0.4] * 3, True), ([0.4, 0.19, 0.4, 0.4], False)]
+    ("confidences", "degrees", "part", "base"),
+    [
+        ([BELIEVED_CONFIDENCE - 0.01] * 2 + [0.8], 0.0, 0.0, 0.8),
+        ([0.015, 0.015, 0.8], 0.0, 0.0, 0.8),
+        ([BELIEVED_CONFIDENCE - 0.01] * 2, 0.0, 0.0, None),
+        ([0.4] * 3, 0.0, 0.0, 0.4),
+        ([0.4, 0.19, 0.4, 0.4], 0.0, 0.0, None),
+        ([0.4] * 3, 14.0, 0.09, 0.4),
+        ([0.4] * 4, 16.0, 0.0, None),
+        ([0.4] * 4, 0.0, 0.11, None),
+        ([0.4] * 5, 16.0, 0.0, 0.4),
+        ([0.4] * 5, 0.0, 0.11, 0.4),
+    ],
 )
-def test_registrations_that_agree_are_followed_without_more_confidence(
-    monkeypatch, answers, follows
+def test_a_pose_is_followed_if_it_is_believed_or_three_agree(
+    monkeypatch, confidences, degrees, part, base
 ):
-    frames = sequence(len(answers) + 1)
-    registrar = truck_registrar()
-    answering(monkeypatch, registrar, answers)
-    follow = Follower(registrar, CAMERA)
-    for (image, box, _), answer in zip(frames, answers, strict=False):
-        assert follow(image, box).confidence == answer
-    assert (follow._base is not None) is follows
-    if follows:
-        assert follow._base == 0.4
-        result = follow(frames[-1][0])
-        degrees, position = errors(result, frames[-1][2])
+    """Its confidence does not rise. The second one is turned about the object's centre, or moved by
+    a part of its distance."""
+    (image, box, T), (second, _, T_second) = sequence(2)
+    follow = Follower(truck_registrar(), CAMERA)
+    centre = follow.registrar.describer.centre
+    turn = rotation_from_axis_angle(torch.deg2rad(double([0.0, degrees, 0.0])))
+    at = (T[:3, :3] @ centre + T[:3, 3]) * (1.0 + part)
+    poses = [T] * len(confidences)
+    poses[1] = pose_around(turn @ T[:3, :3], at, centre)
+    answering(monkeypatch, *map(answer, poses, confidences))
+    for confidence in confidences:
+        assert follow(image, box).confidence == confidence
+    assert follow._base == base
+    if base is not None:
+        result = follow(second)
+        degrees, position = errors(result, T_second)
         assert (degrees < 4.0, position < 0.04) == (True, True)
-
-
-@pytest.mark.parametrize(("degrees", "part"), slow_after(1, [(16.0, 0.0), (0.0, 0.11)]))
-def test_registrations_that_disagree_are_not_followed(monkeypatch, degrees, part):
-    """The second is turned about the object's centre, or moved by a part of its distance."""
-    (image, box, _) = sequence(1)[0]
-    registrar = truck_registrar()
-    register = type(registrar).register_prepared
-    centre = registrar.describer.centre
-    calls = []
-
-    def call(self, items, **options):
-        found = register(self, items, **options)[0]
-        object.__setattr__(found, "probabilities", (0.4, 0.0))
-        T, K = found.projection
-        calls.append(T)
-        if len(calls) == 2:
-            turn = rotation_from_axis_angle(torch.deg2rad(double([0.0, degrees, 0.0])))
-            at = (T[:3, :3] @ centre + T[:3, 3]) * (1.0 + part)
-            moved = pose_around(turn @ T[:3, :3], at, centre)
-            first = replace(found.hypotheses[0], projection=(moved, K))
-            object.__setattr__(found, "hypotheses", (first, *found.hypotheses[1:]))
-        return [found]
-
-    monkeypatch.setattr(type(registrar), "register_prepared", call)
-    follow = Follower(registrar, CAMERA)
-    for _ in range(4):
-        follow(image, box)
-    assert follow._base is None
-    follow(image, box)
-    assert follow._base == 0.4, "the last three agree"
+        assert result.confidence <= base
+        assert set(result.confidence_features) == TRACKED
 
 
 def test_confidence_is_a_fraction_of_that_of_the_first_pose_and_not_raised_by_the_same_frame(
     monkeypatch,
 ):
-    frames = sequence(2)
+    (image, box, T), (second, _, _) = sequence(2)
     found = []
     for first in (1.0, 0.7):
-        registrar = truck_registrar()
-        with monkeypatch.context() as patch:
-            answering(patch, registrar, [first])
-            follow = Follower(registrar, CAMERA)
-            follow(*frames[0][:2])
-            found.append(follow(frames[1][0]))
+        follow = Follower(truck_registrar(), CAMERA)
+        answering(monkeypatch, answer(T, first))
+        follow(image, box)
+        found.append(follow(second))
     assert found[1].confidence == pytest.approx(0.7 * found[0].confidence, rel=1e-6)
-    registrar = truck_registrar()
-    answering(monkeypatch, registrar, [0.6])
-    follow = Follower(registrar, CAMERA)
-    assert max(follow(*frames[0][:2]).confidence for _ in range(5)) <= 0.6
+    follow = Follower(truck_registrar(), CAMERA)
+    answering(monkeypatch, answer(T, 0.6))
+    assert max(follow(image, box).confidence for _ in range(5)) <= 0.6
 
 
 @pytest.mark.parametrize("with_box", slow_after(1, [True, False]))
 def test_a_wrong_start_never_becomes_believed(with_box):
     """Seen from behind: a registration of the next frame does not confirm it."""
     frames = sequence(2)
-    behind = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
     follow = Follower(learned_registrar(), CAMERA)
-    follow.start(frames[0][0], frames[0][2] @ behind)
+    follow.start(frames[0][0], frames[0][2] @ HALF_TURN)
     follow._base = 0.45  # doubtful
     image, box, T = frames[1]
     result = follow(image, box if with_box else None)
@@ -181,7 +153,7 @@ def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
     follow = Follower(learned_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2])
     with monkeypatch.context() as patch:
-        patch.setattr("curvireg_torch.registration.tracking.tracking_confidence", lambda _: 0.3)
+        patch.setattr(tracking, "tracking_confidence", lambda _: 0.3)
         patch.setattr(tracking, "refine_one", LOST)
         assert follow(frames[1][0]).confidence == pytest.approx(0.3)
     with monkeypatch.context() as patch:
@@ -218,12 +190,9 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
     frames = sequence(2)
     follow = Follower(truck_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2])
-    monkeypatch.setattr(
-        "curvireg_torch.registration.tracking.tracking_confidence", lambda _: tracked
-    )
+    monkeypatch.setattr(tracking, "tracking_confidence", lambda _: tracked)
     monkeypatch.setattr(tracking, "refine_one", LOST)
-    failed = FailedRegistration(LostObjectError("no"))
-    monkeypatch.setattr(Registrar, "register_prepared", lambda *_, **__: [failed])
+    answering(monkeypatch, FailedRegistration(LostObjectError("no")))
     result = follow(frames[1][0])
     assert result.ok == kept
     assert not kept or result.confidence == pytest.approx(tracked)
@@ -232,12 +201,11 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
 @pytest.mark.parametrize(("confidence", "used"), [(0.89, False), (0.95, True)])
 def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, confidence, used):
     frames = sequence(2)
-    registrar = truck_registrar()
-    follow = Follower(registrar, CAMERA)
+    follow = Follower(truck_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2])
-    monkeypatch.setattr("curvireg_torch.registration.tracking.tracking_confidence", lambda _: 0.1)
+    monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 0.1)
     monkeypatch.setattr(tracking, "refine_one", LOST)
-    answering(monkeypatch, registrar, [confidence])
+    answering(monkeypatch, answer(frames[1][2], confidence))
     result = follow(*frames[1][:2])
     assert result.ok == used
     assert not used or result.confidence == confidence
@@ -245,7 +213,9 @@ def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, 
 
 def test_follower_loses_an_absent_object_and_finds_it_again():
     frames = sequence(2)
-    follow = Follower(learned_registrar(), CAMERA)
+    known = learned_registrar()
+    few = replace(known.pipeline, detection=DetectionSettings(proposals=4, min_size=0.2))
+    follow = Follower(Registrar(known.bank, pipeline=few), CAMERA)
     follow(*frames[0][:2])
     empty = procedural_background(SIZE, seeded(5))
     lost = follow(empty)

@@ -6,7 +6,7 @@ from functools import cache
 import pytest
 import torch
 
-from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch import sample_views
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.mesh.round_axis import RoundAxis
 from curvireg_torch.registration.confidence import probability_of_any, shares
@@ -14,7 +14,7 @@ from curvireg_torch.registration.judging import Rivals, axis_of, directions_agre
 from curvireg_torch.registration.result import AXIS_TOLERANCE, Axis
 from curvireg_torch.visualization.contours import AXIS
 from curvireg_torch.visualization.overlay import contour_overlay, registration_sheet
-from tests._support import answer_of, double
+from tests._support import answer_of, bank_of, double, exact_registrar
 from tests._support.canisters import canister
 from tests._support.results import FEATURES, registration
 from tests.registration.test_ties import hollow_box, photograph, registrar_of
@@ -37,7 +37,7 @@ def rivals_of(*viewpoints, scores):
 def of_canister():
     """Seen from where the turn is hard to tell."""
     views = sample_views(azimuth_step=15, elevations=[-50, -25, 0, 25, 50])
-    registrar = Registrar(ViewBank.build(canister(), views, image_size=96, progress=False))
+    registrar = exact_registrar(bank_of(canister(), views, image_size=96))
     image, box, T = photograph(canister(), 160.0, 40.0, 1)
     return registrar, answer_of(registrar, image, box), (image, box, T)
 

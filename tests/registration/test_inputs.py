@@ -60,9 +60,9 @@ def test_cameras_and_boxes_that_look_like_mistakes_are_questioned_or_refused():
 def test_result_with_a_questionable_camera_is_never_reliable():
     image, box, T = scene(0)
     far = camera_matrix(260.0, 260.0, 300.0, 400.0)
-    bank = learned_registrar().bank
-    pipeline = replace(bank.pipeline, fit=FitSettings(reliable=0.0))
-    registrar = Registrar(bank, pipeline=pipeline)
+    known = learned_registrar()
+    pipeline = replace(known.pipeline, fit=FitSettings(reliable=0.0))
+    registrar = Registrar(known.bank, pipeline=pipeline)
     good, bad = (registrar([image], box[None], K)[0] for K in (CAMERA, far))
     assert good.reliable
     assert good.warnings == ()

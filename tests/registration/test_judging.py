@@ -11,12 +11,11 @@ from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import judged
-from tests._support import CAMERA, SIZE, double
-from tests._support.hypotheses import evidence_of, poses_at, turned
+from tests._support import CAMERA, SIZE, double, eye
+from tests._support.hypotheses import HALF_TURN, evidence_of, poses_at, turned
 
 HULL = 0.3 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 BOX = torch.tensor([90.0, 60.0, 150.0, 120.0])
-HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
 
 
 class Limits:
@@ -135,7 +134,7 @@ def test_views_up_to_symmetries_are_near():
     poses = poses_at(0.0, 90.0)
     plain = judgement(poses, evidence).confidence_features["ranking_share"]
     assert plain == pytest.approx(1.0 / (1.0 + 0.5**4 + 0.25**4))
-    two = torch.stack([torch.eye(4), HALF_TURN])
+    two = torch.stack([eye(4), HALF_TURN])
     both = judgement(poses, evidence, symmetries=two).confidence_features["ranking_share"]
     assert both == pytest.approx((1.0 + 0.25**4) / (1.0 + 0.5**4 + 0.25**4))
 
@@ -145,7 +144,7 @@ def test_siblings_are_rivals_though_the_shape_looks_the_same(siblings):
     """A small feature of the mesh tells them apart; without one, both are one answer."""
     evidence = evidence_of(0.6, 0.5)
     poses = poses_at(0.0, 180.0)
-    two = torch.stack([torch.eye(4), HALF_TURN])
+    two = torch.stack([eye(4), HALF_TURN])
     assert judgement(poses, evidence, symmetries=two).probabilities[1] == 0.0
     told = replace(poses, is_sibling=torch.tensor(siblings))
     assert judgement(told, evidence, symmetries=two).probabilities[1] > 0.0

@@ -4,11 +4,11 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch import sample_views
 from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
 from curvireg_torch.registration import judging
-from curvireg_torch.registration.hypotheses import Hypotheses
-from tests._support import CAMERA, answer_of, learned_registrar, scene
+from tests._support import answer_of, bank_of, exact_registrar, learned_registrar, scene
+from tests._support.hypotheses import placed_at
 from tests._support.poses import poses as random_poses
 
 
@@ -19,12 +19,6 @@ def chiral_mesh():
         trimesh.creation.box((0.2, 0.7, 0.2)).apply_translation((-0.4, 0.4, 0.1)),
     ]
     return trimesh.util.concatenate(parts)
-
-
-def placed_at(T, mesh):
-    nothing = torch.zeros(len(T))
-    cameras = CAMERA.expand(len(T), 3, 3)
-    return Hypotheses.at(T, cameras, mesh_centre(mesh), nothing.long(), nothing.double())
 
 
 def test_mirrored_mesh_is_inside_out_nowhere():
@@ -40,7 +34,7 @@ def test_reflected_poses_show_the_mesh_reflected():
     rotation = T[0, :3, :3]
     plane = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     centres = mesh_centre(mesh), mesh_centre(mirrored(mesh))
-    found = judging.reflected_poses(placed_at(T, mesh), plane, *centres).T
+    found = judging.reflected_poses(placed_at(T, centres[0]), plane, *centres).T
     vertices = torch.from_numpy(mesh.vertices.copy())
     seen = vertices @ rotation.T + T[0, :3, 3]
     position = rotation @ mesh_centre(mesh) + T[0, :3, 3]
@@ -78,10 +72,9 @@ def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
     image, box, _ = scene(0)
     own = learned_registrar()
     assert answer_of(own, image, box).reliable
-    views = sample_views(azimuth_step=15, elevations=[0, 20, 40, 60])
-    mesh = mirrored(own.bank.mesh)
-    bank = ViewBank.build(mesh, views, image_size=96, progress=False)
+    views = sample_views(azimuth_step=30, elevations=[0, 30, 60])
+    bank = bank_of(mirrored(own.bank.mesh), views, image_size=96)
     monkeypatch.setattr(judging, "LEAST_CONFIDENCE", 0.0)
-    flipped = Registrar(bank)([image], box[None], CAMERA)[0]
+    flipped = answer_of(exact_registrar(bank), image, box)
     assert judging.MIRROR_WARNING in flipped.warnings
     assert gains[0] < 0.0 < gains[1]

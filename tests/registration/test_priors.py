@@ -30,6 +30,7 @@ from tests._support import (
     truck_bank,
     truck_registrar,
 )
+from tests._support.hypotheses import placed_at
 
 IMAGE, BOX, T = scene(0)
 ONE = ([IMAGE], BOX[None], CAMERA)
@@ -83,12 +84,10 @@ def test_limits_hold_in_the_camera_of_the_photograph():
 def pose_at(away=1.5, degrees=0.0):
     """A pose whose centre is so far away, off the optical axis, rotated about the axis."""
     describer = truck_registrar().describer
-    index = torch.zeros(1, dtype=torch.long)
-    one = torch.ones(1, dtype=torch.float64)
     pose = eye(4)[None].clone()
     pose[0, :3, :3] = rotation_from_axis_angle(double([0.0, 0.0, math.radians(degrees)]))
     pose[0, :3, 3] = away * double([0.6, 0.0, 0.8]) - pose[0, :3, :3] @ describer.centre
-    return Hypotheses.at(pose, CAMERA[None], describer.centre, index, one)
+    return placed_at(pose, describer.centre)
 
 
 def test_fitted_poses_up_to_three_degrees_outside_are_kept_and_within_a_degree_of_a_limit_lie_at_it():  # noqa: E501

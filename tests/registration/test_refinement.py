@@ -13,19 +13,22 @@ from curvireg_torch.synthetic import procedural_background, synthesize_photograp
 from tests._support import (
     CAMERA,
     SIZE,
+    bank_of,
     double,
     errors,
+    exact_registrar,
     learned_registrar,
     scene,
     seeded,
     slow_after,
-    truck_bank,
+    truck_registrar,
 )
+from tests._support.hypotheses import HALF_TURN
 
 
 @pytest.fixture(scope="module")
 def registrar():
-    return cr.Registrar(truck_bank())
+    return truck_registrar()
 
 
 def moved(T, degrees=0.0, distance=0.0, axis=(0.6, 0.0, 0.8)):
@@ -108,16 +111,13 @@ def test_refine_calls_the_object_lost_below_its_limit(registrar, monkeypatch, co
     assert registrar.refine([image], CAMERA, [T])[0].ok is ok
 
 
-TURNED = torch.diag(double([-1.0, -1.0, 1.0, 1.0]))
-
-
 @pytest.mark.parametrize("seed", slow_after(1, [1, 0]))
 def test_a_half_turn_does_not_become_believed_by_being_refined(seed):
     """The fit alone trusts contours that look alike from behind; all views of the bank, ranked
     again, do not."""
     registrar = learned_registrar()
     image, box, T = scene(seed)
-    right, wrong = registrar.refine([image] * 2, CAMERA, [moved(T, degrees=3.0), T @ TURNED])
+    right, wrong = registrar.refine([image] * 2, CAMERA, [moved(T, degrees=3.0), T @ HALF_TURN])
     assert errors(right, T)[0] < 2.0
     assert not wrong.ok or wrong.confidence < min(0.5, right.confidence)
     registered = registrar([image], box[None], CAMERA)[0]
@@ -129,7 +129,7 @@ def test_poses_that_look_alike_are_confirmed_by_the_same_registration(number):
     """A cuboid, from its true pose and from that which a half turn makes of it."""
     mesh = trimesh.creation.box((0.2, 0.3, 0.15))
     views = cr.sample_views(azimuth_step=30, elevations=[0, 30, 60])
-    registrar = cr.Registrar(cr.ViewBank.build(mesh, views, image_size=96, progress=False))
+    registrar = exact_registrar(bank_of(mesh, views, image_size=96))
     R = cr.rotation_from_viewpoint(30.0, 30.0, 0.0).double()
     T = transform(R, double([0.0, 0.0, 1.2]))
     image, _ = synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(0))

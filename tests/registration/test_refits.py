@@ -9,7 +9,8 @@ import torch
 from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import stages
-from tests._support.hypotheses import evidence_of, poses_at
+from tests._support import eye
+from tests._support.hypotheses import HALF_TURN, evidence_of, poses_at
 
 MOVE = 1e-3
 
@@ -100,8 +101,7 @@ def test_a_pose_that_stays_keeps_its_evidence(monkeypatch):
 
 def test_symmetric_poses_are_no_rivals(monkeypatch):
     refit = Refits(monkeypatch, {})
-    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
-    group = torch.stack([torch.eye(4), half_turn])
+    group = torch.stack([eye(4), HALF_TURN])
     refit.run(poses_at(0.0, 180.0), evidence_of(0.9, 0.85), symmetries=group)
     assert refit.fitted == [[0]]
     assert refit.compared == []

@@ -8,12 +8,12 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch import Registrar, sample_views
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.fitting.details import ContourDetails
 from curvireg_torch.registration import FailedRegistration, judging, stages
 from curvireg_torch.registration.judging import best_of_meshes, joined
-from tests._support import CAMERA, learned_registrar, slow_after
+from tests._support import answer_of, bank_of, learned_registrar, slow_after
 from tests._support.results import registration
 from tests.registration.test_ties import photograph
 
@@ -33,12 +33,13 @@ def truck(*, with_cabin=True):
 def bank(*, with_cabin=True, scale=1.0):
     mesh = truck(with_cabin=with_cabin).copy().apply_scale(scale)
     views = sample_views(azimuth_step=30, elevations=[10, 30, 50])
-    return ViewBank.build(mesh, views, image_size=96, progress=False)
+    return bank_of(mesh, views, image_size=96)
 
 
 def registered(shown, *banks):
     image, box, _ = photograph(shown, 35.0, 25.0, 0)
-    return Registrar(list(banks))([image], box[None], CAMERA)[0]
+    pipeline = learned_registrar().pipeline  # photographs are registered once
+    return answer_of(Registrar(list(banks), pipeline=pipeline), image, box)
 
 
 @pytest.mark.parametrize("order", slow_after(1, [-1, 1]))

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 from curvireg_torch import Registrar, rotation_error
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.mesh import mesh_radius
+from curvireg_torch.registration import stages
 from curvireg_torch.registration.rig import Rig
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 from tests._support import (
@@ -51,8 +52,14 @@ def rig_of(which, noise=0.1):
     return list(images), list(boxes), torch.stack(poses) @ torch.linalg.inv(WORLD)
 
 
+@cache
+def registrar():
+    """Of boxes as they are given."""
+    return Registrar(learned_registrar().bank)
+
+
 def registered(images, boxes, cameras):
-    return learned_registrar().register_views(images, boxes, CAMERA, cameras)
+    return registrar().register_views(images, boxes, CAMERA, cameras)
 
 
 def check_pose(result, *, degrees=2.0, shift=0.1):
@@ -62,24 +69,36 @@ def check_pose(result, *, degrees=2.0, shift=0.1):
     assert off.norm() < shift * mesh_radius(example_mesh())
 
 
-@pytest.fixture(scope="module")
-def fits():
-    """What the joint fits of ``easy`` began from, and the poses that they found."""
-    return []
-
-
-@pytest.fixture(scope="module")
-def easy(fits):
+def watched(registrar):
+    """The result of the easy photographs, and what its joint fits began from and found."""
+    fits = []
     fitted = Rig.fitted
 
-    def watched(rig, problem, T, radii):
+    def watch(rig, problem, T, radii):
         found = fitted(rig, problem, T, radii)
         fits.append((T.clone(), found[0].clone()))
         return found
 
+    images, boxes, cameras = rig_of(EASY)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Rig, "fitted", watched)
-        return registered(*rig_of(EASY))
+        patch.setattr(Rig, "fitted", watch)
+        return registrar.register_views(images, boxes, CAMERA, cameras), fits
+
+
+@pytest.fixture(scope="module")
+def easy_and_fits():
+    return watched(registrar())
+
+
+@pytest.fixture(scope="module")
+def easy(easy_and_fits):
+    return easy_and_fits[0]
+
+
+@pytest.fixture(scope="module")
+def first():
+    """The first photograph of ``easy``, as a rig."""
+    return registered(*(part[:1] for part in rig_of(EASY)))
 
 
 def test_pose_in_the_world_and_in_each_photograph(easy):
@@ -97,13 +116,14 @@ def test_pose_in_the_world_and_in_each_photograph(easy):
 
 
 @pytest.mark.parametrize(
-    ("first", "wrong", "degrees"), slow_after(1, [((335.0, 102), 2, 15.0), ((40.0, 104), 2, 3.0)])
+    ("first", "wrong", "degrees"), slow_after(1, [((335.0, 102), 3, 15.0), ((40.0, 104), 2, 3.0)])
 )
-def test_half_turns_in_doubt_are_decided_together(first, wrong, degrees):
+def test_half_turns_in_doubt_are_decided_together(monkeypatch, first, wrong, degrees):
     """Views of the two ends differ by half a turn, but not of the same world: only the truth is
     common to all, also where each photograph alone is wrong."""
     images, boxes, cameras = rig_of((first, *IN_DOUBT[1:]), noise=0.36)
-    alone = learned_registrar()(images, torch.stack(boxes), CAMERA)
+    monkeypatch.setattr(stages, "_in_box_of_pose", lambda *_: None)  # each is registered once
+    alone = registrar()(images, torch.stack(boxes), CAMERA)
     errors = [
         float(rotation_error(r.rotation, (c @ WORLD)[:3, :3]))
         for r, c in zip(alone, cameras, strict=True)
@@ -112,10 +132,9 @@ def test_half_turns_in_doubt_are_decided_together(first, wrong, degrees):
     check_pose(registered(images, boxes, cameras), degrees=degrees, shift=0.2)
 
 
-@pytest.mark.usefixtures("easy")
-def test_the_joint_fit_begins_at_each_pose_and_where_a_coarse_fit_moves_it(fits):
+def test_the_joint_fit_begins_at_each_pose_and_where_a_coarse_fit_moves_it(easy_and_fits):
     """On full shelves the coarse fit moved right poses by 1 to 8 degrees."""
-    (candidates, moved), (begun, _), *_ = fits
+    (candidates, moved), (begun, _), *_ = easy_and_fits[1]
     assert begun.equal(torch.cat([candidates, moved]))
     assert not moved.equal(candidates)
 
@@ -164,26 +183,22 @@ def test_without_any_box_the_object_is_searched_for():
     check_pose(registered(images, None, cameras))
 
 
-def test_one_photograph_gives_the_answer_of_the_registrar():
+def test_one_photograph_gives_the_answer_of_the_registrar(first):
     images, boxes, cameras = (part[:1] for part in rig_of(EASY))
-    alone = learned_registrar()(images, torch.stack(boxes), CAMERA)[0]
-    result = registered(images, boxes, cameras)
-    assert_close(cameras[0] @ result.transform, alone.transform)
-    assert result.probabilities == alone.probabilities
+    alone = registrar()(images, torch.stack(boxes), CAMERA)[0]
+    assert_close(cameras[0] @ first.transform, alone.transform)
+    assert first.probabilities == alone.probabilities
     R = cameras[0, :3, :3]
-    assert_close(R @ result.covariance[3:, 3:] @ R.T, alone.covariance[3:, 3:])
+    assert_close(R @ first.covariance[3:, 3:] @ R.T, alone.covariance[3:, 3:])
 
 
-def test_covariance_shrinks_with_photographs(easy):
-    images, boxes, cameras = rig_of(EASY)
-    two = registered(images[:2], boxes[:2], cameras[:2])
-    deviations = [
-        torch.linalg.eigvalsh(r.hypotheses[0].covariance[3:, 3:]).sqrt() for r in (two, easy)
-    ]
-    alone = registered(images[:1], boxes[:1], cameras[:1])
-    largest = torch.linalg.eigvalsh(alone.hypotheses[0].covariance[3:, 3:])[-1].sqrt()
-    assert float(deviations[0][-1]) < 0.5 * float(largest)  # the depth is seen from the side
-    assert float(deviations[1].prod()) < float(deviations[0].prod())
+def test_covariance_shrinks_with_photographs(first, easy):
+    two = registered(*(part[:2] for part in rig_of(EASY)))
+    one, both, three = (
+        torch.linalg.eigvalsh(r.hypotheses[0].covariance[3:, 3:]).sqrt() for r in (first, two, easy)
+    )
+    assert both[-1] < 0.5 * one[-1]  # the depth is seen from the side
+    assert three.prod() < both.prod()
 
 
 def test_covariance_grows_where_photographs_contradict_each_other(easy):
@@ -215,10 +230,6 @@ def test_bad_rigs_name_the_photograph():
             lambda T: in_another_unit(T, 1000.0),
             "image 0: T_cam_from_world: by its size .* mesh's unit",
         ),
-        (
-            lambda T: in_another_unit(T, 0.001),
-            "image 0: T_cam_from_world: by its size .* mesh's unit",
-        ),
         (lambda T: T[[0, 1, 1]], "image 2 and image 1: T_cam_from_world: the same, but"),
         (
             lambda T: torch.cat([T[:1], 1.1 * T[1:2], T[2:]]),
@@ -238,7 +249,7 @@ def test_bad_rigs_name_the_photograph():
     with refused(r"boxes: expected shape \(3, 4\)"):
         registered(images, boxes[:2], cameras)
     with refused("needs the camera matrix"):
-        learned_registrar().register_views(images, boxes, None, cameras)
+        registrar().register_views(images, boxes, None, cameras)
 
 
 def test_copies_of_a_photograph_are_no_evidence():
@@ -252,14 +263,13 @@ def test_copies_of_a_photograph_are_no_evidence():
     assert [view.failure for view in thrice.views] == [None, copy, copy]
 
 
-def test_rigs_compare_rivals_that_are_not_reported():
+def test_rigs_compare_rivals_that_are_not_reported(easy_and_fits):
     """Of each photograph five, though one is reported."""
-    images, boxes, cameras = rig_of(IN_DOUBT[:2], noise=0.3)
+    easy, fits = easy_and_fits
     bank = learned_registrar().bank
     assert bank.pipeline.hypotheses == 5
-    five = registered(images, boxes, cameras)
-    alone = Registrar(bank, pipeline=replace(bank.pipeline, hypotheses=1))
-    one = alone.register_views(images, boxes, CAMERA, cameras)
+    one, same_fits = watched(Registrar(bank, pipeline=replace(bank.pipeline, hypotheses=1)))
     assert (len(one.hypotheses), len(one.probabilities)) == (1, 1)
-    assert one.confidence == pytest.approx(five.confidence)
-    assert one.confidence_features == pytest.approx(five.confidence_features)
+    assert len(same_fits[0][0]) == len(fits[0][0]) > len(EASY)
+    assert one.confidence == pytest.approx(easy.confidence)
+    assert one.confidence_features == pytest.approx(easy.confidence_features)

@@ -10,27 +10,21 @@ import torch
 from torch.testing import assert_close
 
 from curvireg_torch.evidence import EvidenceWeights
-from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint, transform
+from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.registration import judging
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import Siblings
 from curvireg_torch.registration.target import TellingSymmetries
-from tests._support import CAMERA, double, eye
-from tests._support.hypotheses import evidence_of
+from tests._support import double, eye
+from tests._support.hypotheses import evidence_of, poses_at
 
 
 def four(similarity, compare, angles):
     """Siblings turned about z by ``angles``, the first of which has the highest score; all look
     different from the others."""
-    R = torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in angles])
-    T = transform(R, double([0.0, 0.0, 5.0]).expand(len(R), 3))
-    index = torch.zeros(len(T), dtype=torch.long)
-    rank = torch.zeros(len(T), dtype=torch.float64)
-    poses = Hypotheses.at(T, CAMERA.expand(len(T), 3, 3), torch.zeros(3).double(), index, rank)
-    different = ~torch.eye(len(T), dtype=torch.bool)
-    details = double(compare)
-    poses = replace(poses, evidence=evidence_of(*similarity))
-    return Siblings(poses, details, different, EvidenceWeights())
+    poses = replace(poses_at(*angles), evidence=evidence_of(*similarity))
+    different = ~torch.eye(len(poses), dtype=torch.bool)
+    return Siblings(poses, double(compare), different, EvidenceWeights())
 
 
 def test_a_sibling_is_better_by_its_score_and_by_details():

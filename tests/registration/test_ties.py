@@ -8,13 +8,22 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import Registrar, sample_views
+from curvireg_torch import sample_views
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from curvireg_torch.registration.target import MAX_SIBLINGS, spread, telling_symmetries
 from curvireg_torch.synthetic import synthesize_photograph
-from tests._support import CAMERA, SIZE, bank_of, eye, seeded, seen_from, slow_after
+from tests._support import (
+    CAMERA,
+    SIZE,
+    bank_of,
+    exact_registrar,
+    eye,
+    seeded,
+    seen_from,
+    slow_after,
+)
 
 
 @cache
@@ -45,7 +54,7 @@ def marked_box():
 @cache
 def registrar_of(mesh, **options):
     views = sample_views(azimuth_step=15, elevations=[10, 30, 50])
-    return Registrar(bank_of(mesh, views, image_size=96), **options)
+    return exact_registrar(bank_of(mesh, views, image_size=96), **options)
 
 
 def photograph(mesh, azimuth, elevation, seed):
@@ -91,7 +100,7 @@ def test_symmetric_mesh_without_given_symmetries_is_ambiguous():
     box = trimesh.creation.box((200, 120, 80))
     assert registered(registrar_of(box), 40.0, 30.0, 0)[0].ambiguous is None
     bank = registrar_of(box).bank
-    result, _ = registered(Registrar(bank, symmetries=torch.eye(4)[None]), 40.0, 30.0, 0)
+    result, _ = registered(exact_registrar(bank, symmetries=eye(4)[None]), 40.0, 30.0, 0)
     assert result.ambiguous is not None
     assert result.confidence <= 0.5
 
@@ -113,7 +122,7 @@ def test_poses_that_only_a_hidden_feature_tells_apart_are_named(side, notable):
     cube.apply_translation((75, 0, 47))
     mesh = trimesh.util.concatenate([box, cube])
     views = sample_views(azimuth_step=15, elevations=[-50, -35])
-    registrar = Registrar(bank_of(mesh, views, image_size=96))
+    registrar = exact_registrar(bank_of(mesh, views, image_size=96))
     assert registrar.telling_symmetries.notable == notable
     result, _ = registered(registrar, 30.0, -40.0, 3)
     assert result.feature_is_hidden
@@ -130,7 +139,7 @@ def test_poses_that_only_a_hidden_feature_tells_apart_are_named(side, notable):
 def test_given_symmetries_are_trusted():
     bank = registrar_of(marked_box()).bank
     group = mesh_symmetries(marked_box())
-    result, _ = registered(Registrar(bank, symmetries=group), 20.0, 35.0, 20)
+    result, _ = registered(exact_registrar(bank, symmetries=group), 20.0, 35.0, 20)
     turned = result.rotation @ group[1:, :3, :3].double()
     for hypothesis in result.hypotheses[1:]:
         assert rotation_error(turned, hypothesis.rotation).min() > 10.0

@@ -79,8 +79,9 @@ def test_a_hidden_half_needs_a_box_that_is_said_to_be_visible(seed):
     result = answer_of(visible_registrar(), image, box)
     assert errors(result, T)[0] < 10.0
     item = as_photograph(image, box, CAMERA)
-    assert _in_box_of_pose(visible_registrar(), [item], result, 0, 0.85) is None
-    assert _in_box_of_pose(learned_registrar(), [item], result, 0, 0.85) is not None
+    assert _in_box_of_pose(visible_registrar(box_jitter=0.1), [item], result, 0, 0.85) is None
+    whole = cr.Registrar(learned_registrar().bank)
+    assert _in_box_of_pose(whole, [item], result, 0, 0.85) is not None
     as_whole = answer_of(learned_registrar(), image, box)
     assert errors(as_whole, T)[0] > 15.0
     assert not as_whole.reliable
@@ -92,7 +93,7 @@ def test_similar_meshes_and_views_of_the_bank_are_compared_as_before():
     for changes, mesh_is in (({}, "similar"), ({"contours": False}, None)):
         found = []
         for box_is in ("whole", "visible"):
-            pipeline = replace(bank.pipeline.with_boxes(box_is), **changes)
+            pipeline = replace(bank.pipeline.with_boxes(box_is), box_jitter=0.0, **changes)
             registrar = cr.Registrar(bank, pipeline=pipeline, mesh_is=mesh_is)
             found.append(answer_of(registrar, image, box).rotation)
         assert found[0].equal(found[1])

@@ -10,7 +10,6 @@ import torch
 import trimesh
 
 from curvireg_torch.rendering import make_renderer
-from tests._support import slow_after
 
 from .conftest import camera, require
 
@@ -51,9 +50,10 @@ for backend in sys.argv[1:]:
 """  # noqa: E501
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 @pytest.mark.parametrize(
-    ("backends", "codes"), slow_after(1, [(["auto", "embree"], ["0", "0"]), (["pyrender"], ["3"])])
+    ("backends", "codes"), [(["auto", "embree"], ["0", "0"]), (["pyrender"], ["3"])]
 )
 def test_renderers_after_a_fork(backends, codes):
     """embree and OpenCV work in the child; OpenGL cannot, and the error says what to do."""
