@@ -13,7 +13,7 @@ from curvireg_torch.errors import LostObjectError
 from curvireg_torch.fitting.details import ContourDetails
 from curvireg_torch.registration import FailedRegistration, judging, stages
 from curvireg_torch.registration.judging import best_of_meshes, joined
-from tests._support import answer_of, bank_of, learned_registrar, slow_after
+from tests._support import CAMERA, answer_of, bank_of, learned_registrar, slow_after
 from tests._support.results import registration
 from tests.registration.test_ties import photograph
 
