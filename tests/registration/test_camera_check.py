@@ -7,6 +7,7 @@ import torch
 
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.registration import camera as camera_module
+from curvireg_torch.registration.block import Block
 from curvireg_torch.registration.camera import focal_contradiction
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support import learned_registrar, seeded, seen_from
@@ -51,16 +52,31 @@ def test_a_focal_length_that_the_photograph_contradicts_is_named_and_not_reliabl
     assert shown == pytest.approx(FOCAL, rel=0.05)
 
 
+@pytest.mark.parametrize(("keypoints", "clear"), [(0.0, 0.2), (0.1, 0.15)])
+def test_a_focal_length_beside_a_print_has_to_be_clearer(monkeypatch, keypoints, clear):
+    image, box = near_photograph()
+    given = []
+    nothing = torch.zeros(1)
+    monkeypatch.setattr(Block, "printed", lambda *_: keypoints)
+    monkeypatch.setattr(
+        camera_module, "focal_gaps", lambda *a: given.append(a[-1]) or (nothing, nothing)
+    )
+    learned_registrar()([image], box[None], camera(1.0))
+    assert torch.cat(given).tolist() == [clear]
+
+
 def test_focal_lengths_of_several_photographs_are_compared_at_once():
     given = [registered(factor)[1] for factor in (0.7, 1.0, 1.3)]
     contours, crops = given[0][:2]
-    cameras, T, index = (torch.cat([one[k] for one in given]) for k in (2, 3, 4))
-    gaps, deviations = camera_module.focal_gaps(contours, crops, cameras, T, index)
+    each = [torch.cat([one[k] for one in given]) for k in (2, 3, 4, 5)]
+    gaps, deviations = camera_module.focal_gaps(contours, crops, *each)
     alone = [float(camera_module.focal_gaps(*one)[0]) for one in given]
     assert gaps.tolist() == pytest.approx(alone, abs=1e-5)
     assert gaps.tolist() == pytest.approx([0.357, 0.0, -0.262], abs=0.04)
     assert deviations[1] == torch.inf, "the first step is small: nobody looked further"
     assert float(deviations[0]) < 0.15
+    strict = camera_module.focal_gaps(contours, crops, *each[:3], deviations.clamp(max=1.0))[1]
+    assert strict.isinf().all(), "as clear as that, none is determined"
 
 
 def test_contradictions_need_a_clear_focal_length_two_deviations_and_a_distance_that_matters():
@@ -70,7 +86,7 @@ def test_contradictions_need_a_clear_focal_length_two_deviations_and_a_distance_
     assert named(0.21, 0.1)
     assert named(-0.21, 0.1)
     assert not named(0.19, 0.1)
-    assert not named(0.6, 0.15), "not determined"
+    assert not named(0.6, torch.inf), "not determined"
     assert named(0.2, 0.05)
     assert not named(0.2, 0.05, 0.1), "the camera is not known better"
     assert named(-0.15, 0.01)
