@@ -1,5 +1,5 @@
 import json
-import operator
+from operator import setitem
 
 import pytest
 import torch
@@ -12,12 +12,25 @@ from tests._support.miniature import write_bop, write_mesh
 
 
 @pytest.fixture
-def tree(tmp_path):
-    return tmp_path, write_bop(tmp_path)
+def reasons(tmp_path):
+    """How often each reason is counted in the set of ``root``."""
+    return write_bop(tmp_path)
 
 
-def edit(tree, name, change):
-    path = tree[0] / "test" / "000001" / name
+@pytest.fixture
+def root(tmp_path, reasons):
+    """A set with two usable scenes."""
+    assert reasons
+    return tmp_path
+
+
+def opened(root):
+    """All instances of a set."""
+    return BOPDataset(root, targets=False)
+
+
+def edit(root, name, change):
+    path = root / "test" / "000001" / name
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
@@ -28,9 +41,8 @@ def ids(dataset):
     return [(s["scene_id"], s["image_id"], s["obj_id"], s["instance_index"]) for s in samples]
 
 
-def test_bop_dataset_counts_skipped_items_and_returns_documented_samples(tree):
-    root, reasons = tree
-    dataset = BOPDataset(root, targets=False)
+def test_bop_dataset_counts_skipped_items_and_returns_documented_samples(root, reasons):
+    dataset = opened(root)
     assert ids(dataset) == [(1, 0, 1, 0), (1, 0, 2, 1), (1, 0, 1, 2), (2, 7, 1, 0)]
     assert dict(dataset.skipped) == reasons
     assert dataset.skipped_items["missing_image"] == ["test/000001/4 #0"]
@@ -54,8 +66,8 @@ def test_bop_dataset_counts_skipped_items_and_returns_documented_samples(tree):
     assert "symmetries_discrete" in sample["model_info"]
 
 
-def test_bop_dataset_reads_hidden_instances_and_grey_images_without_scene_gt_info(tree):
-    dataset = BOPDataset(tree[0], targets=False)
+def test_bop_dataset_reads_hidden_instances_and_grey_images_without_scene_gt_info(root):
+    dataset = opened(root)
     hidden = dataset[1]
     sample = dataset[3]
     assert hidden["visib_fract"] == 0
@@ -69,21 +81,21 @@ def test_bop_dataset_reads_hidden_instances_and_grey_images_without_scene_gt_inf
     assert sample["visib_fract"] != sample["visib_fract"]
 
 
-def test_targets_select_the_most_visible_instances(tree):
+def test_targets_select_the_most_visible_instances(root):
     for targets in (None, True):
-        dataset = BOPDataset(tree[0], targets=targets)
+        dataset = BOPDataset(root, targets=targets)
         assert ids(dataset) == [(1, 0, 1, 2), (2, 7, 1, 0)]
         assert dataset.skipped["no_target"] == 3
         assert "test/000001/000006 object 1" in dataset.skipped_items["missing_annotation"]
-    (tree[0] / "test_targets_bop19.json").unlink()
-    assert len(BOPDataset(tree[0])) == 4
+    (root / "test_targets_bop19.json").unlink()
+    assert len(BOPDataset(root)) == 4
     with refused("test_targets_bop19", MissingFileError):
-        BOPDataset(tree[0], targets=True)
+        BOPDataset(root, targets=True)
 
 
-def test_other_splits_have_no_targets_by_default(tree):
-    (tree[0] / "test").rename(tree[0] / "train_pbr")
-    assert len(BOPDataset(tree[0], "train_pbr")) == 4
+def test_other_splits_have_no_targets_by_default(root):
+    (root / "test").rename(root / "train_pbr")
+    assert len(BOPDataset(root, "train_pbr")) == 4
 
 
 def test_a_missing_split_names_those_that_are_there(tmp_path):
@@ -98,68 +110,66 @@ def test_a_missing_split_names_those_that_are_there(tmp_path):
     assert str(folder) in str(error.value)
 
 
-def test_scenes_of_several_cameras_are_named(tree):
-    for scene in (tree[0] / "test").iterdir():
+def test_scenes_of_several_cameras_are_named(root):
+    for scene in (root / "test").iterdir():
         if (scene / "scene_gt.json").is_file():
             for camera in ("cam2", "cam1"):
                 for name in ("scene_gt", "scene_gt_info"):
                     (scene / f"{name}_{camera}.json").write_text("{}")
             (scene / "scene_gt_coco_cam3.json").write_text("{}")
-    assert len(BOPDataset(tree[0], targets=False)) == 4, "files without a camera go first"
-    for file in (tree[0] / "test").glob("*/scene_gt.json"):
+    assert len(opened(root)) == 4, "files without a camera go first"
+    for file in (root / "test").glob("*/scene_gt.json"):
         file.unlink()
     with refused("several cameras: cam1, cam2; copy the files of"):
-        BOPDataset(tree[0])
-    for file in (tree[0] / "test").glob("*/scene_gt_cam*.json"):
+        BOPDataset(root)
+    for file in (root / "test").glob("*/scene_gt_cam*.json"):
         file.unlink()
-    assert BOPDataset(tree[0]).skipped["missing_annotation"], "not those of boxes alone"
+    assert BOPDataset(root).skipped["missing_annotation"], "not those of boxes alone"
 
 
-def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(tree, tmp_path):
-    for root, split in ((tmp_path / "nothing", "test"), (tree[0], "train"), (tree[0], "../test")):
+def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(root):
+    for folder, split in ((root / "nothing", "test"), (root, "train"), (root, "../test")):
         with refused(r"datasets/bop/README\.md", MissingFileError):
-            BOPDataset(root, split)
+            BOPDataset(folder, split)
     for content in ("[", "[" * 100000, "[1]", '[{"scene_id": 1}]', "{}"):
-        (tree[0] / "test_targets_bop19.json").write_text(content)
+        (root / "test_targets_bop19.json").write_text(content)
         with refused("test_targets_bop19"):
-            BOPDataset(tree[0])
-    (tree[0] / "test_targets_bop19.json").unlink()
-    for path in (tree[0] / "models").iterdir():
+            BOPDataset(root)
+    (root / "test_targets_bop19.json").unlink()
+    for path in (root / "models").iterdir():
         path.unlink()
     with refused("models_info", MissingFileError):
-        BOPDataset(tree[0])
+        BOPDataset(root)
+
+
+WHOLE = {"diameter": 86.6}
 
 
 @pytest.mark.parametrize(
-    ("change", "match"),
+    ("entry", "match"),
     [
-        (lambda info: info["1"].pop("diameter"), "entry '1': expected a diameter > 0"),
-        (lambda info: info["1"].update(diameter="100"), "diameter"),
-        (lambda info: info["1"].update(diameter=0), "diameter"),
-        (lambda info: info.update({"1": "text"}), "entry '1'"),
-        (
-            lambda info: info["1"].update(symmetries_discrete=None),
-            "symmetries_discrete: expected a list",
-        ),
-        (lambda info: info["1"].update(symmetries_discrete=[[0] * 16]), "expected rigid"),
-        (lambda info: info["1"].update(symmetries_continuous=[{}]), "axis: expected"),
-        (lambda info: info["1"].update(symmetries_continuous=[7]), "symmetries_continuous"),
-        (lambda info: info.update({"1" * 5000: info["1"]}), "entry '11111111111111111111'"),
+        ({}, "entry '1': expected a diameter > 0"),
+        ({"diameter": "100"}, "diameter"),
+        ({"diameter": 0}, "diameter"),
+        ("text", "entry '1'"),
+        (WHOLE | {"symmetries_discrete": None}, "symmetries_discrete: expected a list"),
+        (WHOLE | {"symmetries_discrete": [[0] * 16]}, "expected rigid"),
+        (WHOLE | {"symmetries_continuous": [{}]}, "axis: expected"),
+        (WHOLE | {"symmetries_continuous": [7]}, "symmetries_continuous"),
+        (WHOLE, "entry '11111111111111111111'"),
     ],
 )
-def test_damaged_models_info_is_refused_when_the_dataset_is_opened(tree, change, match):
-    edit(tree, "../../models/models_info.json", change)
+def test_damaged_models_info_is_refused_when_the_dataset_is_opened(root, entry, match):
+    number = "1" * 5000 if entry is WHOLE else "1"
+    edit(root, "../../models/models_info.json", lambda info: info.update({number: entry}))
     with refused(rf"models_info\.json: .*{match}") as caught:
-        BOPDataset(tree[0])
+        BOPDataset(root)
     assert len(str(caught.value)) < 500
-
-
-MIRRORED = [-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]
 
 
 ROTATIONS = [
     *(None, "x", {"a": 1}, [1, 2], ["1"] * 9, [True] * 9, [1e400] * 9, [10**400] * 9),
-    MIRRORED,
+    [-1, 0, 0, 0, 0, -1, 0, 1, 0],  # mirrored
 ]
 BOXES = [[4, 4, 0, 20], [4, 4, 30, 0], [-1, -1, -1, -1]]
 
@@ -171,40 +181,36 @@ BOXES = [[4, 4, 0, 20], [4, 4, 30, 0], [-1, -1, -1, -1]]
         *(("scene_gt_info.json", "bbox_obj", box, "bad_box") for box in BOXES),
     ],
 )
-def test_bop_dataset_counts_invalid_rotations_and_boxes(tree, name, key, value, reason):
-    edit(tree, name, lambda content: content["0"][0].update({key: value}))
-    dataset = BOPDataset(tree[0], targets=False)
-    assert dataset.skipped[reason] == tree[1][reason] + 1
+def test_bop_dataset_counts_invalid_rotations_and_boxes(root, reasons, name, key, value, reason):
+    edit(root, name, lambda content: content["0"][0].update({key: value}))
+    dataset = opened(root)
+    assert dataset.skipped[reason] == reasons[reason] + 1
     assert len(dataset) == 3
 
 
 @pytest.mark.parametrize(("place", "value"), [(0, 0.0), (4, -500.0), (1, 2.0), (8, 2.0)])
-def test_bop_dataset_skips_invalid_cameras(tree, place, value):
-    before = BOPDataset(tree[0], targets=False)
-    edit(
-        tree,
-        "scene_camera.json",
-        lambda content: operator.setitem(content["0"]["cam_K"], place, value),
-    )
-    after = BOPDataset(tree[0], targets=False)
+def test_bop_dataset_skips_invalid_cameras(root, place, value):
+    before = opened(root)
+    edit(root, "scene_camera.json", lambda cameras: setitem(cameras["0"]["cam_K"], place, value))
+    after = opened(root)
     lost = len(before) - len(after)
     assert lost > 0
     assert after.skipped["corrupt_annotation"] == before.skipped["corrupt_annotation"] + lost
 
 
-def test_bop_dataset_prefers_colour_to_grey_and_instances_of_known_visibility(tree):
-    scene = tree[0] / "test" / "000001"
+def test_bop_dataset_prefers_colour_to_grey_and_instances_of_known_visibility(root):
+    scene = root / "test" / "000001"
     (scene / "gray").mkdir()
     (scene / "gray" / "000000.tif").write_bytes(b"")
-    assert "/rgb/" in BOPDataset(tree[0], targets=False).annotation(0)["image_path"]
-    edit(tree, "scene_gt_info.json", lambda content: content["0"][2].pop("visib_fract"))
+    assert "/rgb/" in opened(root).annotation(0)["image_path"]
+    edit(root, "scene_gt_info.json", lambda content: content["0"][2].pop("visib_fract"))
     # of two instances, the one that is 0.8 visible
-    assert ids(BOPDataset(tree[0]))[0] == (1, 0, 1, 0)
+    assert ids(BOPDataset(root))[0] == (1, 0, 1, 0)
 
 
-def test_bop_dataset_measures_models_without_models_info(tree):
-    (tree[0] / "models" / "models_info.json").unlink()
-    dataset = BOPDataset(tree[0], targets=False)
+def test_bop_dataset_measures_models_without_models_info(root):
+    (root / "models" / "models_info.json").unlink()
+    dataset = opened(root)
     assert dataset.models_info[1]["diameter"] == pytest.approx(50 * 3**0.5)
     assert [dataset.models_info[1][key] for key in ("min_x", "size_z")] == pytest.approx(
         [-25.0, 50.0]
@@ -212,51 +218,51 @@ def test_bop_dataset_measures_models_without_models_info(tree):
     assert ids(dataset) == [(1, 0, 1, 0), (1, 0, 2, 1), (1, 0, 1, 2), (1, 3, 9, 4), (2, 7, 1, 0)]
 
 
-def test_bop_dataset_reads_names_with_fewer_digits_and_other_folders_of_models(tree):
-    models = (tree[0] / "models").rename(tree[0] / "models_cad")
+def test_bop_dataset_reads_names_with_fewer_digits_and_other_folders_of_models(root):
+    models = (root / "models").rename(root / "models_cad")
     for path in models.glob("obj_*.ply"):
         path.rename(path.with_name(f"obj_{path.stem[-2:]}.ply"))
-    scene = tree[0] / "test" / "000001"
+    scene = root / "test" / "000001"
     for path in (scene / "rgb").iterdir():
         path.rename(path.with_name(path.name[2:]))  # 0000.jpg
     scene.rename(scene.with_name("01"))
-    dataset = BOPDataset(tree[0], targets=False, models="models_cad")
+    dataset = BOPDataset(root, targets=False, models="models_cad")
     assert sorted(ids(dataset)) == [(1, 0, 1, 0), (1, 0, 1, 2), (1, 0, 2, 1), (2, 7, 1, 0)]
     assert dataset[0]["model_path"].endswith("obj_01.ply")
     with refused("models_info", MissingFileError):
-        BOPDataset(tree[0])
+        BOPDataset(root)
     with refused("no such folder", MissingFileError):
-        BOPDataset(tree[0], models="../models_cad")
+        BOPDataset(root, models="../models_cad")
 
 
 @pytest.mark.parametrize("factor", [1e-3, 0.1, 25.4])
-def test_bop_dataset_refuses_models_in_another_unit_than_models_info(tree, factor):
+def test_bop_dataset_refuses_models_in_another_unit_than_models_info(root, factor):
     for number in (1, 2, 9):
-        write_mesh(tree[0] / "models" / f"obj_{number:06d}.ply", half=25.0 * factor)
+        write_mesh(root / "models" / f"obj_{number:06d}.ply", half=25.0 * factor)
     with refused(r"across, models_info\.json says 86\.6: .*scale the models to mm") as error:
-        BOPDataset(tree[0])
+        BOPDataset(root)
     assert ("in metres?" in str(error.value)) == (factor == 1e-3)
 
 
-def test_bop_dataset_refuses_models_in_metres_without_models_info(tree):
-    (tree[0] / "models" / "models_info.json").unlink()
+def test_bop_dataset_refuses_models_in_metres_without_models_info(root):
+    (root / "models" / "models_info.json").unlink()
     for number in (1, 2, 9):
-        write_mesh(tree[0] / "models" / f"obj_{number:06d}.ply", half=0.025)
+        write_mesh(root / "models" / f"obj_{number:06d}.ply", half=0.025)
     with refused(r"the mesh is 0\.065 px wide: in metres\? scale it to mm"):
-        BOPDataset(tree[0])
+        BOPDataset(root)
 
 
-def test_bop_dataset_refuses_poses_in_metres(tree):
+def test_bop_dataset_refuses_poses_in_metres(root):
     def in_metres(content):
         content["0"][0]["cam_t_m2c"] = [value / 1000 for value in content["0"][0]["cam_t_m2c"]]
 
-    edit(tree, "scene_gt.json", in_metres)
+    edit(root, "scene_gt.json", in_metres)
     with refused(r"image 0 the mesh is 86\.6 across and 0\.4 away: cam_t_m2c in metres"):
-        BOPDataset(tree[0], targets=False)
+        opened(root)
 
 
-def test_bop_dataset_reads_nested_matrices_and_zeros_before_numbers(tree):
-    before = BOPDataset(tree[0], targets=False)
+def test_bop_dataset_reads_nested_matrices_and_zeros_before_numbers(root):
+    before = opened(root)
 
     def nested(content):
         for name, value in list(content.items()):
@@ -266,39 +272,39 @@ def test_bop_dataset_reads_nested_matrices_and_zeros_before_numbers(tree):
                     entry[key] = [rows[:3], rows[3:6], rows[6:]]
             content[name.zfill(6)] = content.pop(name)
 
-    edit(tree, "scene_camera.json", nested)
-    after = BOPDataset(tree[0], targets=False)
+    edit(root, "scene_camera.json", nested)
+    after = opened(root)
     assert ids(after) == ids(before)
     assert_close(after[0]["camera_matrix"], before[0]["camera_matrix"])
-    edit(tree, "scene_gt.json", lambda content: nested({"0": content["0"][:1]}))
-    after = BOPDataset(tree[0], targets=False)
+    edit(root, "scene_gt.json", lambda content: nested({"0": content["0"][:1]}))
+    after = opened(root)
     assert ids(after) == ids(before)
     assert_close(after[0]["rotation"], before[0]["rotation"])
 
 
-def test_files_of_bop_may_begin_with_a_byte_order_mark(tree):
-    before = BOPDataset(tree[0])
-    for path in tree[0].rglob("*.json"):
+def test_files_of_bop_may_begin_with_a_byte_order_mark(root):
+    before = BOPDataset(root)
+    for path in root.rglob("*.json"):
         path.write_text("\ufeff" + path.read_text(), encoding="utf-8")
-    after = BOPDataset(tree[0])
+    after = BOPDataset(root)
     assert (ids(after), after.skipped) == (ids(before), before.skipped)
 
 
-def test_bop_dataset_names_folders_that_are_no_scenes(tree):
-    for scene in (tree[0] / "test").iterdir():
+def test_bop_dataset_names_folders_that_are_no_scenes(root):
+    for scene in (root / "test").iterdir():
         scene.rename(scene.with_name(f"scene_{scene.name}"))
     with refused("no scene, which is a folder with a number", MissingFileError):
-        BOPDataset(tree[0])
+        BOPDataset(root)
 
 
-def test_bop_dataset_without_scene_gt_info_skips_what_is_behind_the_camera(tree):
-    scene = tree[0] / "test" / "000002" / "scene_gt.json"
+def test_bop_dataset_without_scene_gt_info_skips_what_is_behind_the_camera(root):
+    scene = root / "test" / "000002" / "scene_gt.json"
     scene.write_text(scene.read_text().replace("400.0", "-400.0"))
-    assert BOPDataset(tree[0], targets=False).skipped["behind_camera"] == 1
+    assert opened(root).skipped["behind_camera"] == 1
 
 
-def test_bop_pictures_are_found_however_their_suffix_is_spelled(tree):
-    before = BOPDataset(tree[0], targets=False)
-    for path in (tree[0] / "test").glob("*/rgb/*"):
+def test_bop_pictures_are_found_however_their_suffix_is_spelled(root):
+    before = opened(root)
+    for path in (root / "test").glob("*/rgb/*"):
         path.rename(path.with_suffix(path.suffix.capitalize()))
-    assert len(BOPDataset(tree[0], targets=False)) == len(before) > 0
+    assert len(opened(root)) == len(before) > 0

@@ -17,6 +17,7 @@ from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.crops import crop_images
 from tests._support import refused
 from tests._support.miniature import write_bop, write_pascal3d, write_web
+from tests._support.tables import text_table
 
 pytestmark = pytest.mark.usefixtures("mats_here")
 
@@ -110,24 +111,24 @@ def test_unknown_poses_have_no_bin(tmp_path):
     assert float(torch.nn.functional.cross_entropy(logits, ignored)) == pytest.approx(math.log(24))
 
 
-@pytest.mark.parametrize(
-    ("viewpoint", "expected"),
-    [
-        ((0.0, 0.0, 0.0), [0, 6, 12]),
-        ((14.99, -0.01, -0.01), [0, 5, 11]),
-        ((15.0, 15.0, 15.0), [1, 7, 13]),
-        ((30.0, 30.0, -30.0), [2, 8, 10]),
-        ((359.99, 89.0, 179.0), [23, 11, 23]),
-        ((345.0, -89.0, -180.0), [23, 0, 0]),
-        ((-15.0, 45.0, 180.0), [23, 9, 0]),
-        ((0.0, 90.0, 0.0), [0, 11, 12]),
-        ((30.0, 100.0, 0.0), [14, 11, 0]),
-        ((30.0, -100.0, 0.0), [14, 0, 0]),
-    ],
-)
+BINS = """
+[0, 0, 0]             | [0, 6, 12]
+[14.99, -0.01, -0.01] | [0, 5, 11]
+[15, 15, 15]          | [1, 7, 13]
+[30, 30, -30]         | [2, 8, 10]
+[359.99, 89, 179]     | [23, 11, 23]
+[345, -89, -180]      | [23, 0, 0]
+[-15, 45, 180]        | [23, 9, 0]
+[0, 90, 0]            | [0, 11, 12]
+[30, 100, 0]          | [14, 11, 0]
+[30, -100, 0]         | [14, 0, 0]
+"""
+
+
+@pytest.mark.parametrize(("viewpoint", "expected"), text_table(BINS))
 def test_viewpoint_bins(viewpoint, expected):
     """Borders belong to the upper bin, whatever the rounding of the rotation."""
-    rotation = rotation_from_viewpoint(*viewpoint).float()  # as samples have it
+    rotation = rotation_from_viewpoint(*map(float, viewpoint)).float()  # as samples have it
     assert viewpoint_bins(rotation, (24, 12, 24)).tolist() == expected
 
 

@@ -13,6 +13,7 @@ from torch.testing import assert_close
 from curvireg_torch.data import images, read_image, read_photo
 from curvireg_torch.errors import ImageError, MissingFileError
 from curvireg_torch.formats import pictures
+from tests._support import refused
 from tests._support.exif import exif, with_exif
 from tests._support.miniature import write_image
 
@@ -166,16 +167,16 @@ def test_panoramas_have_no_pinhole_camera(tmp_path):
     tags = Image.Exif()
     tags.get_ifd(0x8769).update({0xA405: 26})
     xmp = b'<x:xmpmeta><rdf:Description GPano:ProjectionType="cylindrical"/></x:xmpmeta>'
-    for name, size, more, is_panorama in (
-        ("a.jpg", (640, 480), {"xmp": xmp}, True),
-        ("a.webp", (640, 480), {"xmp": xmp}, True),
-        ("b.jpg", (640, 480), {"xmp": xmp.replace(b"GPano", b"Other")}, False),
-        ("c.jpg", (640, 256), {}, False),
-        ("d.jpg", (641, 256), {}, True),
-        ("e.jpg", (256, 641), {}, True),
-        ("f.jpg", (640, 270), {}, False),  # 21 : 9
+    for name, size, words, is_panorama in (
+        ("a.jpg", (640, 480), xmp, True),
+        ("a.webp", (640, 480), xmp, True),
+        ("b.jpg", (640, 480), xmp.replace(b"GPano", b"Other"), False),
+        ("c.jpg", (640, 256), b"", False),
+        ("d.jpg", (641, 256), b"", True),
+        ("e.jpg", (256, 641), b"", True),
+        ("f.jpg", (640, 270), b"", False),  # 21 : 9
     ):
-        Image.new("RGB", size).save(tmp_path / name, exif=tags, **more)
+        Image.new("RGB", size).save(tmp_path / name, exif=tags, xmp=words)
         photo = read_photo(tmp_path / name)
         assert photo.is_panorama == is_panorama
         assert (photo.camera() is None) == is_panorama
@@ -190,16 +191,10 @@ def test_read_photo_rounds_16_bits_converts_cmyk_and_notes_changes_of_channels(t
     cv2.imwrite(str(tmp_path / "b.png"), np.array([[0, 128, 129, 65535]], np.uint16))
     assert read_photo(tmp_path / "b.png").image[0].tolist() == [[0, 0, 1, 255]]
     notes = {1: ("grey: three equal channels",), 3: (), 4: ("alpha channel dropped",)}
-    for name, channels in {
-        "png": (1, 4),
-        "webp": (3, 4),
-        "tiff": (1,),
-        "bmp": (3,),
-        "pgm": (1,),
-    }.items():
-        for count in channels:
-            assert cv2.imwrite(str(tmp_path / f"a.{name}"), np.full((4, 4, count), 9, np.uint8))
-            assert read_photo(tmp_path / f"a.{name}").notes == notes[count], name
+    for name in ("1.png", "4.png", "3.webp", "4.webp", "1.tiff", "3.bmp", "1.pgm"):
+        count = int(name[0])
+        assert cv2.imwrite(str(tmp_path / name), np.full((4, 4, count), 9, np.uint8))
+        assert read_photo(tmp_path / name).notes == notes[count], name
     colour = Image.new("RGB", (8, 8))  # phones add previews to photographs
     colour.save(tmp_path / "phone.jpg", format="MPO", save_all=True, append_images=[colour])
     assert read_photo(tmp_path / "phone.jpg").notes == ()
@@ -215,13 +210,14 @@ def test_read_photo_refuses_cielab_floating_pixels_and_other_formats(tmp_path):
     assert cv2.imwrite(str(tmp_path / "b.tif"), np.ones((4, 4, 3), np.float32))
     Image.fromarray(np.ones((4, 4), np.int32)).save(tmp_path / "c.tif")
     Image.new("L", (4, 4)).save(tmp_path / "d.gif")
-    for name, match in (
-        ("a.tif", "CIELAB"),
-        ("b.tif", "convert"),
-        ("c.tif", "32 bits"),
-        ("d.gif", "JPEG, PNG, TIFF"),
-    ):
-        with pytest.raises(ImageError, match=rf"{name}: .*{match}"):
+    expected = {
+        "a.tif": "CIELAB",
+        "b.tif": "convert",
+        "c.tif": "32 bits",
+        "d.gif": "JPEG, PNG, TIFF",
+    }
+    for name, match in expected.items():
+        with refused(rf"{name}: .*{match}", ImageError):
             read_photo(tmp_path / name)
 
 
@@ -233,12 +229,10 @@ def test_read_image_refuses_truncated_other_and_missing_files(tmp_path, suffix):
     others = (b"", b"no image at all", b"\xff\xd8\xff\xd9", b"\x89PNG\r\n\x1a\nIEND")
     for content in (*(data[: int(len(data) * fraction)] for fraction in (0.02, 0.5, 0.9)), *others):
         path.write_bytes(content)
-        with pytest.raises(ImageError, match=r"a\.\w+: (damaged or truncated|not an image)"):
+        with refused(r"a\.\w+: (damaged or truncated|not an image)", ImageError):
             read_image(path)
     for path in (tmp_path / "nothing.jpg", tmp_path):
-        with pytest.raises(
-            MissingFileError, match="no such file; check the path of the photograph"
-        ):
+        with refused("no such file; check the path of the photograph", MissingFileError):
             read_image(path)
 
 
@@ -259,9 +253,7 @@ def test_read_photo_counts_pixels_before_it_decodes(tmp_path):
     for name, content in (("a.bmp", bmp), ("a.png", b"\x89PNG\r\n\x1a\n" + b"".join(chunks))):
         (tmp_path / name).write_bytes(content)
         tracemalloc.start()
-        with pytest.raises(
-            ImageError, match=rf"{name}: more than 89,478,485 pixels; scale it down"
-        ):
+        with refused(rf"{name}: more than 89,478,485 pixels; scale it down", ImageError):
             read_photo(tmp_path / name)
         assert tracemalloc.get_traced_memory()[1] < 20e6
         tracemalloc.stop()
@@ -272,7 +264,7 @@ def test_read_photo_bounds_bytes(tmp_path, monkeypatch):
     path = tmp_path / "a.jpg"
     Image.new("RGB", (64, 64), (200, 100, 50)).save(path)
     monkeypatch.setattr(pictures, "MAX_IMAGE_BYTES", 100)
-    with pytest.raises(ImageError, match="larger than 100 bytes"):
+    with refused("larger than 100 bytes", ImageError):
         read_photo(path)
 
 
@@ -301,18 +293,12 @@ def test_read_photo_keeps_the_orientation_if_the_rest_of_exif_is_damaged(tmp_pat
 @pytest.mark.parametrize("bits", [8, 10, 12, 14])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_few_bits_in_sixteen_are_stretched(tmp_path, bits, channels):
-    shape = (6, 8, 3)[: 2 if channels == 1 else 3]
-    pixels = np.random.default_rng(bits).integers(0, 2**bits, shape).astype(np.uint16)
+    pixels = np.random.default_rng(bits).integers(0, 2**bits, (6, 8, channels)).astype(np.uint16)
     pixels[0, 0] = 2**bits - 1
     cv2.imwrite(str(tmp_path / "camera.png"), pixels)
     photo = read_photo(tmp_path / "camera.png")
-    expected = (
-        np.round(pixels[..., ::-1] * 255.0 / (2**bits - 1))
-        if channels == 3
-        else pixels * 255.0 / (2**bits - 1)
-    )
-    shown = photo.image.movedim(0, -1).numpy().astype(float)
-    assert np.abs(shown - (expected if channels == 3 else expected[..., None])).max() <= 0.5 + 1e-9
+    shown = photo.image.movedim(0, -1).numpy()
+    assert np.abs(shown - pixels[..., ::-1] * 255.0 / (2**bits - 1)).max() <= 0.5 + 1e-9
     assert f"16 bits, of which the lower {bits} are used: stretched" in photo.notes
 
 
@@ -346,7 +332,7 @@ def test_thumbnails_before_the_picture_of_a_tiff_are_passed_over(tmp_path, count
     pages.append(pages[0].copy())
     pages[-1].encoderinfo = {"tiffinfo": {254: 1}}
     pages[0].save(tmp_path / "b.tif", tiffinfo={254: 1}, save_all=True, append_images=pages[1:])
-    with pytest.raises(ImageError, match="holds thumbnails only"):
+    with refused("holds thumbnails only", ImageError):
         read_photo(tmp_path / "b.tif")
 
 
@@ -396,7 +382,7 @@ def test_exif_camera_respects_crops_and_pictures_of_pillow(tmp_path):
 )
 def test_what_a_download_leaves_in_place_of_a_photograph_is_named(tmp_path, start, words):
     (tmp_path / "a.jpg").write_bytes(start)
-    with pytest.raises(ImageError, match=rf"a\.jpg: {words}"):
+    with refused(rf"a\.jpg: {words}", ImageError):
         read_photo(tmp_path / "a.jpg")
 
 

@@ -7,9 +7,16 @@ import scipy.io
 
 from curvireg_torch.data.mat_files import read_mats
 from curvireg_torch.errors import MAX_MAT_BYTES, WorkerError
-from tests._support.matlab import element, file
 from tests._support.miniature import pascal_object, write_record
 from tests._support.refusals import refused
+
+
+def element(kind, content):
+    return struct.pack("<II", kind, len(content)) + content + b"\0" * (-len(content) % 8)
+
+
+def file(content):
+    return b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM" + content
 
 
 def array(array_class, dims, rest, name=b"record"):

@@ -19,6 +19,7 @@ from curvireg_torch.registration.photograph import as_photographs
 from tests._support.exif import exif, with_exif
 from tests._support.real_data import real_case
 from tests._support.refusals import refused
+from tests._support.tables import text_table
 
 SIZE = (48, 64)
 BOX = (15.5, 11.5, 47.5, 35.5)  # of the pixels 16 to 47 and 12 to 35
@@ -86,35 +87,35 @@ def test_the_best_box_of_yolo(tmp_path, photo):
         box_of(labels, "other.png")
 
 
-@pytest.mark.parametrize(
-    ("line", "score", "track"),
-    [
-        ("0 0.5 0.5 0.5 0.5", 1.0, ""),
-        ("\ufeff0 0.5 0.5 0.5 0.5", 1.0, ""),  # with a byte-order mark
-        ("0 0.5 0.5 0.5 0.5 0.25", 0.25, ""),
-        ("0 0.5 0.5 0.5 0.5 7", 1.0, "7"),  # of yolo track
-        ("0 0.5 0.5 0.5 0.5 0.25 7", 0.25, "7"),
-        ("0 0.25 0.5 0.5 0.25 0.75 0.75", 1.0, ""),  # a triangle
-        ("0 0.25 0.25 0.75 0.25 0.75 0.75 0.25 0.75", 1.0, ""),  # an oriented box
-        ("0 0.5 0.25 0.75 0.5 0.5 0.75 0.25 0.5 0.25", 0.25, ""),  # with its score
-        ("0 0.25 0.5 0.5 0.25 0.75 0.5 0.6 0.75 0.4 0.75", 1.0, ""),  # a polygon
-    ],
-)
-def test_lines_of_yolo_are_boxes_oriented_boxes_and_polygons(tmp_path, line, score, track):
+YOLO = """
+0 0.5 0.5 0.5 0.5                                | 1.0  |     | a box
+\ufeff0 0.5 0.5 0.5 0.5                          | 1.0  |     | with a byte-order mark
+0 0.5 0.5 0.5 0.5 0.25                           | 0.25 |     | with its score
+0 0.5 0.5 0.5 0.5 7                              | 1.0  | "7" | of yolo track
+0 0.5 0.5 0.5 0.5 0.25 7                         | 0.25 | "7" | with its score
+0 0.25 0.5 0.5 0.25 0.75 0.75                    | 1.0  |     | a triangle
+0 0.25 0.25 0.75 0.25 0.75 0.75 0.25 0.75        | 1.0  |     | an oriented box
+0 0.5 0.25 0.75 0.5 0.5 0.75 0.25 0.5 0.25       | 0.25 |     | with its score
+0 0.25 0.5 0.5 0.25 0.75 0.5 0.6 0.75 0.4 0.75   | 1.0  |     | a polygon
+"""
+
+
+@pytest.mark.parametrize(("line", "score", "track", "kind"), text_table(YOLO))
+def test_lines_of_yolo_are_boxes_oriented_boxes_and_polygons(tmp_path, line, score, track, kind):
     (box,) = read_boxes(written(tmp_path / "a.txt", line))
     assert box.corners == pytest.approx((0.25, 0.25, 0.75, 0.75))
-    assert (box.score, box.track, box.labels) == (score, track, {"0"})
+    assert (box.score, box.track, box.labels) == (score, track, {"0"}), kind
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("0 0.5 0.5 0.5", "line 1: expected CLASS CX CY WIDTH HEIGHT"),
-        ("0 0.5 0.5 0.5 nan", "line 1: expected CLASS CX CY WIDTH HEIGHT"),
-        ("0 0.5 0.5 0.5 0.5 1.5", "a score of 1.5, above 1"),
-        ("0 0.5 0.5 0.5 0.5 1.5 3", "a score of 1.5, above 1"),
-    ],
-)
+NO_YOLO = """
+0 0.5 0.5 0.5           | line 1: expected CLASS CX CY WIDTH HEIGHT
+0 0.5 0.5 0.5 nan       | line 1: expected CLASS CX CY WIDTH HEIGHT
+0 0.5 0.5 0.5 0.5 1.5   | a score of 1.5, above 1
+0 0.5 0.5 0.5 0.5 1.5 3 | a score of 1.5, above 1
+"""
+
+
+@pytest.mark.parametrize(("line", "words"), text_table(NO_YOLO))
 def test_other_lines_of_yolo_are_refused(tmp_path, line, words):
     with refused(f"a.txt: {words}"):
         read_boxes(written(tmp_path / "a.txt", line))
@@ -351,20 +352,21 @@ def test_folders_of_labels_have_the_folders_of_the_photographs(tmp_path):
         of(Path("shots/cam2/a.jpg"))
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("a.json", {"a": 1}, "expected detections of COCO, or annotations of LabelMe"),
-        ("a.json", [{"image_id": 1}], "entry 0: expected bbox of 4 numbers"),
-        ("a.json", {"shapes": [{"points": [[1, 2], [3]]}]}, "shape 0: expected points x, y"),
-        ("a.json", {"shapes": [{"points": [[1, 2]]}]}, "shape 0: expected points x, y"),
-        ("a.xml", "<svg/>", "expected <annotation> of Pascal VOC"),
-        ("a.xml", "<annotation><object/></annotation>", "object 0: expected <bndbox> of xmin"),
-        ("a.xml", "<annotation>", "damaged, or no XML that is read"),
-        ("a.xml", "<!DOCTYPE a [<!ENTITY b 'c'>]><annotation/>", "an XML document type"),
-    ],
-)
-def test_what_is_no_file_of_boxes_is_refused(tmp_path, name, content, words):
+NO_BOXES = """
+{"a": 1}                                    | expected detections of COCO, or annotations of LabelMe
+[{"image_id": 1}]                           | entry 0: expected bbox of 4 numbers
+{"shapes": [{"points": [[1, 2], [3]]}]}     | shape 0: expected points x, y
+{"shapes": [{"points": [[1, 2]]}]}          | shape 0: expected points x, y
+<svg/>                                      | expected <annotation> of Pascal VOC
+<annotation><object/></annotation>          | object 0: expected <bndbox> of xmin
+<annotation>                                | damaged, or no XML that is read
+<!DOCTYPE a [<!ENTITY b 'c'>]><annotation/> | an XML document type
+"""
+
+
+@pytest.mark.parametrize(("content", "words"), text_table(NO_BOXES))
+def test_what_is_no_file_of_boxes_is_refused(tmp_path, content, words):
+    name = "a.xml" if isinstance(content, str) else "a.json"
     file = written(tmp_path / name, content)
     with refused(f"{name}: .*{words}"):
         BoxFile(file)

@@ -7,11 +7,12 @@ import torch
 
 from curvireg_torch import load_camera
 from curvireg_torch.errors import MAX_CAMERA_BYTES, InvalidInputError
-from tests._support.calibrations import K, check_camera, check_refused
+from tests._support.calibrations import K, check_camera
 from tests._support.doubling import check_linear
 from tests._support.refusals import refused
 
-D = np.array([[-0.31, 0.12, 0.001, -0.002, 0.03]])
+LENS = (-0.31, 0.12, 0.001, -0.002, 0.03)
+FISHEYE = (0.02, -0.01, 0.003, -0.001)
 
 ROS = """image_width: 640
 image_height: 480
@@ -87,46 +88,44 @@ def check(camera, distortion, *, fy=522.0, **expected):
     check_camera(camera, distortion, matrix=matrix, **expected)
 
 
+def store(file, **values):
+    """Write a file of OpenCV, with a comment where it may have one."""
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    if file.suffix != ".json":
+        storage.writeComment("flags: +zero_tangent_dist")
+    for name, value in values.items():
+        storage.write(name, value)
+    storage.release()
+
+
 @pytest.mark.parametrize("suffix", ["yml", "yaml", "xml", "json"])
 def test_opencv(tmp_path, suffix):
     file = tmp_path / f"camera.{suffix}"
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    storage.write("calibration_time", "Thu 01 Jan 2026: [noon")
-    storage.write("image_width", 640)
-    storage.write("image_height", 480)
-    if suffix != "json":
-        storage.writeComment("flags: +zero_tangent_dist")
-    storage.write("camera_matrix", K)
-    storage.write("distortion_coefficients", D)
-    storage.write("image_points", np.random.default_rng(0).random((40, 2)).astype(np.float32))
-    storage.release()
-    check(load_camera(file), tuple(D[0]))
+    store(
+        file,
+        calibration_time="Thu 01 Jan 2026: [noon",
+        image_width=640,
+        image_height=480,
+        camera_matrix=K,
+        distortion_coefficients=np.array([LENS]),
+        image_points=np.random.default_rng(0).random((40, 2)).astype(np.float32),
+    )
+    check(load_camera(file), LENS)
 
 
 def test_opencv_with_other_keys_and_bop(tmp_path, read):
     file = tmp_path / "fisheye.yml"
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    for name, value in {"cameraMatrix": K, "distCoeffs": D[0, :4], "fisheye_model": 1}.items():
-        storage.write(name, value)
-    storage.release()
-    check(load_camera(file), tuple(D[0, :4]), model="fisheye", size=None)
+    store(file, cameraMatrix=K, distCoeffs=np.array(LENS[:4]), fisheye_model=1)
+    check(load_camera(file), LENS[:4], model="fisheye", size=None)
     check(
         read(file.read_text().replace("fisheye_model: 1", "fisheye_model: 0"), "fisheye.yml"),
-        tuple(D[0, :4]),
+        LENS[:4],
         size=None,
     )
     file = tmp_path / "python.json"
-    check(read({"mtx": K.tolist(), "dist": D.tolist(), "image_size": [640, 480]}), tuple(D[0]))
-    bop = {
-        "cx": 321.25,
-        "cy": 238.5,
-        "depth_scale": 1.0,
-        "fx": 520.5,
-        "fy": 522.0,
-        "height": 480,
-        "width": 640,
-    }
-    check(read(bop), ())
+    check(read({"mtx": K.tolist(), "dist": [LENS], "image_size": [640, 480]}), LENS)
+    bop = {"fx": 520.5, "fy": 522.0, "cx": 321.25, "cy": 238.5, "height": 480, "width": 640}
+    check(read({**bop, "depth_scale": 1.0}), ())
 
 
 @pytest.mark.parametrize(
@@ -134,7 +133,7 @@ def test_opencv_with_other_keys_and_bop(tmp_path, read):
 )
 def test_ros_camera_info(write, text):
     file = write("camera_info.yaml", text.encode())
-    check(load_camera(file), tuple(D[0]))
+    check(load_camera(file), LENS)
 
 
 def test_other_models_of_ros(read):
@@ -143,7 +142,7 @@ def test_other_models_of_ros(read):
         numbers = tuple(0.01 * k for k in range(count))
         check(
             read(
-                ROS.replace("plumb_bob", ros_model).replace(str(D[0].tolist()), str(list(numbers))),
+                ROS.replace("plumb_bob", ros_model).replace(str(list(LENS)), str(list(numbers))),
                 f"{ros_model}.yaml",
             ),
             numbers,
@@ -153,9 +152,9 @@ def test_other_models_of_ros(read):
 
 def test_kalibr(write):
     file = write("camchain.yaml", KALIBR)
-    check(load_camera(f"{file}:cam0"), tuple(D[0, :4]))
+    check(load_camera(f"{file}:cam0"), LENS[:4])
     camera = load_camera(f"{file}:cam1")
-    assert (camera.model, camera.distortion) == ("fisheye", (0.02, -0.01, 0.003, -0.001))
+    assert (camera.model, camera.distortion) == ("fisheye", FISHEYE)
 
 
 def test_colmap_counts_from_the_corner_of_the_picture(write):
@@ -164,8 +163,8 @@ def test_colmap_counts_from_the_corner_of_the_picture(write):
     check(load_camera(f"{file}:2"), ())
     check(load_camera(f"{file}:3"), (-0.31, 0.0, 0.0, 0.0), fy=520.5)
     check(load_camera(f"{file}:4"), (-0.31, 0.12, 0.0, 0.0), fy=520.5)
-    check(load_camera(f"{file}:5"), tuple(D[0, :4]))
-    check(load_camera(f"{file}:6"), (0.02, -0.01, 0.003, -0.001), model="fisheye")
+    check(load_camera(f"{file}:5"), LENS[:4])
+    check(load_camera(f"{file}:6"), FISHEYE, model="fisheye")
 
 
 def test_malicious_files_are_refused(tmp_path, write):
@@ -180,139 +179,15 @@ def test_malicious_files_are_refused(tmp_path, write):
         ("a.yaml", " " * (MAX_CAMERA_BYTES + 1), "larger than 4,194,304 bytes"),
     ):
         write(name, content)
-        with pytest.raises(InvalidInputError, match=words) as error:
+        with refused(words) as error:
             load_camera(tmp_path / name)
         assert str(error.value).startswith(f"{tmp_path / name}: ")
         assert error.value.kind == "calibration"
         assert "--" not in error.value.message, "options are of the command line"
 
 
-FLAT = {"fx": 520.5, "fy": 522.0, "cx": 321.25, "cy": 238.5}
-FIVE = {"k1": -0.31, "k2": 0.12, "p1": 0.001, "p2": -0.002, "k3": 0.03}
-FOUR = {key: value for key, value in FIVE.items() if key != "k3"}
-LENS = D[0].tolist()
 MATRIX = K.tolist()
-SIZE = {"width": 640, "height": 480}
-CORNER = {"fl_x": 520.5, "fl_y": 522.0, "cx": 321.75, "cy": 239.0, "w": 640, "h": 480}
 OWN = {"matrix": MATRIX, "distortion": LENS[:4], "model": "radial-tangential", "size": [480, 640]}
-
-JSON = {
-    "width first": ({"K": MATRIX, "resolution": [640, 480]}, (), (480, 640)),
-    "single keys in a dict": ({**FLAT, "distortion_parameters": FIVE}, tuple(LENS), None),
-    "camera in a dict": ({"dist": LENS, "intrinsics": FLAT, **SIZE}, tuple(LENS), (480, 640)),
-    "radial and tangential": (
-        {
-            "K": MATRIX,
-            "RadialDistortion": [-0.31, 0.12, 0.03],
-            "TangentialDistortion": [0.001, -0.002],
-        },
-        tuple(LENS),
-        None,
-    ),
-    "radial alone": (
-        {"K": MATRIX, "radial_distortion": [-0.31, 0.12]},
-        (-0.31, 0.12, 0.0, 0.0),
-        None,
-    ),
-    "realsense": (
-        {
-            "ppx": 321.25,
-            "ppy": 238.5,
-            "fx": 520.5,
-            "fy": 522.0,
-            "coeffs": LENS,
-            "model": "brown_conrady",
-            **SIZE,
-        },
-        tuple(LENS),
-        (480, 640),
-    ),
-    "realsense without distortion": (
-        {**FLAT, "coeffs": [0.0] * 5, "model": "distortion.brown_conrady", "name": "D435", **SIZE},
-        (0.0,) * 5,
-        (480, 640),
-    ),
-    "bouguet": ({"fc": [520.5, 522.0], "cc": [321.25, 238.5], "kc": LENS}, tuple(LENS), None),
-    "a camera's product name": ({**FLAT, "model": "Logitech C920", "distortion": None}, (), None),
-}
-
-
-@pytest.mark.parametrize(("content", "distortion", "size"), JSON.values(), ids=JSON)
-def test_json_of_other_tools(read, content, distortion, size):
-    check(read(content), distortion, size=size)
-
-
-SINGULAR = (
-    "dist_coeff",
-    "dist_coef",
-    "coeffs",
-    "distortion_coefs",
-    "distortion_parameters",
-    "distCoeffs",
-    "lens_distortion",
-)
-
-
-@pytest.mark.parametrize("key", SINGULAR)
-def test_distortion_by_the_names_that_tools_give_it(read, key):
-    check(read({"camera_matrix": MATRIX, key: [LENS]}), tuple(LENS), size=None)
-
-
-REFUSED = {
-    "another name": (
-        {"K": MATRIX, "my_distortion": LENS},
-        "'my_distortion': looks like distortion",
-    ),
-    "beside a nested camera": (
-        {"a": {"K": MATRIX}, "b": {"radial_terms": [0.1]}},
-        "'radial_terms': looks like",
-    ),
-    "inside an unknown dict": ({"K": MATRIX, "lens": {"k1": -0.3}}, "'k1': looks like distortion"),
-    "a coefficient too much": (
-        {**FLAT, "distortion": {**FOUR, "k9": 1}},
-        "'k9': looks like distortion",
-    ),
-    "two lists": (
-        {"K": MATRIX, "dist": LENS, "distortion": [1.0, *LENS[1:]]},
-        "'dist': looks like distortion",
-    ),
-    "text": ({"K": MATRIX, "distortion_b": "-0.3 0.1"}, "'distortion_b': looks like distortion"),
-    "inverse model": (
-        {**FLAT, "coeffs": LENS, "model": "inverse_brown_conrady"},
-        "'inverse_brown_conrady' is not",
-    ),
-    "projection": (
-        {"K": [[520, 0, 321, 5], [0, 520, 238, 0], [0, 0, 1, 0]]},
-        "also moves the camera",
-    ),
-    "projection by column": (
-        {"K": [[520, 0, 0, 0], [0, 520, 0, 0], [321, 238, 1, 0], [5, 0, 0, 1]]},
-        "also moves the camera",
-    ),
-    "mei": (
-        {"model_type": "MEI", "projection_parameters": {"gamma1": 1.0}},
-        "'MEI' is not supported",
-    ),
-    "field of view": (
-        {"camera_angle_x": 0.7, "frames": []},
-        "no fl_x; without it, give the field of view",
-    ),
-    "no centre": ({"fl_x": 520.5, "w": 640, "h": 480}, "no cx and cy"),
-    "a polynomial of nerfstudio": ({**CORNER, "k4": 0.1}, "k4 of nerfstudio"),
-    "fisheye with tangential": (
-        {**FLAT, **FOUR, "is_fisheye": True},
-        "a fisheye has k1, k2, k3, k4 alone",
-    ),
-    "radial and tangential of a fisheye": (
-        {**FLAT, "camera_model": "fisheye", "radial": [0.1, 0.2], "tangential": [0.1, 0.0]},
-        "coefficients of the model 'fisheye'",
-    ),
-}
-
-
-@pytest.mark.parametrize(("content", "words"), REFUSED.values(), ids=REFUSED)
-def test_no_distortion_is_dropped_in_silence(tmp_path, content, words):
-    check_refused(tmp_path, content, words)
 
 
 def test_zero_distortion_and_distances_are_no_distortion(read):
@@ -350,32 +225,31 @@ def test_yaml_of_pyyaml_and_of_other_tools(read):
     yaml = pytest.importorskip("yaml")
     content = {
         "camera_matrix": MATRIX,
-        "dist_coeff": D.tolist(),
+        "dist_coeff": [[*LENS]],
         "image_width": 640,
         "image_height": 480,
     }
     for flow in (False, True, None):
-        check(read(yaml.dump(content, default_flow_style=flow), "camera.yaml"), tuple(LENS))
-    fisheye = (
-        "   k2: 0.02\n   k3: -0.01\n   k4: 0.003\n   k5: -0.001\n   mu: 520.5\n   mv: "
-        "522\n   u0: "
-        "321.25\n   v0: 238.5"
+        check(read(yaml.dump(content, default_flow_style=flow), "camera.yaml"), LENS)
+    numbers = (
+        "k2: 0.02, k3: -0.01, k4: 0.003, k5: -0.001, mu: 520.5, mv: 522, u0: 321.25, v0: 238.5"
     )
+    fisheye = numbers.replace(", ", "\n   ")
     check(
         read(
             f"%YAML:1.0\n---\nmodel_type: KANNALA_BRANDT\nimage_width: 640\nimage_height: 480\n"
-            f"projection_parameters:\n{fisheye}\n",
+            f"projection_parameters:\n   {fisheye}\n",
             "camera.yaml",
         ),
-        (0.02, -0.01, 0.003, -0.001),
+        FISHEYE,
         model="fisheye",
     )
 
 
 def test_arrays_of_numpy(tmp_path):
     file = tmp_path / "B.npz"
-    np.savez_compressed(file, K=K.astype(np.float32), D=D[0])
-    assert load_camera(file).distortion == tuple(LENS)
+    np.savez_compressed(file, K=K.astype(np.float32), D=np.array(LENS))
+    assert load_camera(file).distortion == LENS
     np.save(tmp_path / "K.npy", K)
     check(load_camera(tmp_path / "K.npy"), (), size=None)
 
@@ -399,13 +273,11 @@ def test_arrays_of_objects_and_damaged_ones_are_refused(tmp_path, write):
 
 def test_stereo_calibrations_name_two_cameras(tmp_path, read):
     file = tmp_path / "intrinsics.yml"
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    for name, value in {"M1": K, "D1": D, "M2": 2 * K - np.diag([0, 0, 1.0]), "D2": 2 * D}.items():
-        storage.write(name, value)
-    storage.release()
-    check(load_camera(f"{file}:1"), tuple(LENS), size=None)
+    D = np.array([LENS])
+    store(file, M1=K, D1=D, M2=2 * K - np.diag([0, 0, 1.0]), D2=2 * D)
+    check(load_camera(f"{file}:1"), LENS, size=None)
     second = load_camera(f"{file}:2")
-    assert second.distortion == tuple(2 * D[0])
+    assert second.distortion == tuple(2 * v for v in LENS)
     assert second.matrix[0, 0] == 1041.0
     with refused("several cameras; choose one as FILE:NAME from 1, 2"):
         load_camera(file)
@@ -415,7 +287,7 @@ def test_stereo_calibrations_name_two_cameras(tmp_path, read):
             {"K_left": MATRIX, "D_left": LENS, "K_right": MATRIX, "D_right": LENS[:4], "R": [1]},
             part="left",
         ),
-        tuple(LENS),
+        LENS,
         size=None,
     )
 
@@ -449,7 +321,7 @@ def test_metashape_counts_from_the_centre_and_swaps_the_tangential_coefficients(
         "<?xml version='1.0'?><calibration><projection>frame</projection><width>640</width><height>480</height>"  # noqa: E501
         f"<f>522</f><cx>1.75</cx><cy>-1</cy><b1>-1.5</b1>{lens}<date>2026-01-01T00:00:00Z</date></calibration>"
     )
-    check(read(text, "calibration.xml"), tuple(LENS))
+    check(read(text, "calibration.xml"), LENS)
     sensor = text.split("?>")[1].replace(
         "<width>640</width><height>480</height>", '<resolution width="640" height="480"/>'
     )
@@ -461,7 +333,7 @@ def test_metashape_counts_from_the_centre_and_swaps_the_tangential_coefficients(
             "calibration.xml",
             part="0",
         ),
-        tuple(LENS),
+        LENS,
     )
     for wrong in ("<b2>0.1</b2>", "<k4>0.1</k4>", "<p3>0.1</p3>"):
         with refused("of Metashape have no counterpart in OpenCV"):
@@ -474,14 +346,6 @@ def test_metashape_counts_from_the_centre_and_swaps_the_tangential_coefficients(
             "calibration.xml",
         ),
         (-0.31, 0.12, 0.03, -0.001),
-        model="fisheye",
-    )
-
-
-def test_nerfstudio_fisheye(read):
-    check(
-        read({**CORNER, "camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k4": -0.001}),
-        (0.02, 0.0, 0.0, -0.001),
         model="fisheye",
     )
 
@@ -506,7 +370,7 @@ def test_ros_region_and_binning_are_applied(read):
         "info.yaml",
     )
     assert camera.size == (50, 200)
-    assert camera.distortion == tuple(LENS)
+    assert camera.distortion == LENS
     # The pixel (101, 40) of the sensor has its left edge at 100.5: the binned one at (0, 0) covers
     # it from 99.5 on.
     x = (321.25 - 99.5) / 2 - 0.5
@@ -519,7 +383,7 @@ def test_ros_region_and_binning_are_applied(read):
             ROS + "binning_x: 1\nroi: {x_offset: 0, y_offset: 0, width: 0, height: 0}\n",
             "info.yaml",
         ),
-        tuple(LENS),
+        LENS,
     )
 
 

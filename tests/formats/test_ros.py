@@ -12,6 +12,7 @@ from curvireg_torch.formats.exports.ros import FILES, ros_covariance, time_stamp
 from curvireg_torch.geometry import rotation_from_axis_angle
 from tests._support.numbers import double, seeded
 from tests._support.refusals import refused
+from tests._support.tables import text_table
 
 DOCUMENT = {
     "translation": [1000.0, -2000.0, 500.0],
@@ -89,18 +90,18 @@ def test_stamps_are_seconds(text):
         time_stamp(text)
 
 
-@pytest.mark.parametrize(
-    ("frame", "is_optical"),
-    [
-        ("camera_optical_frame", True),
-        ("cam: 1", True),
-        ("linked", True),
-        ("world", False),
-        ("robot/map", False),
-        ("camera_link", False),
-        ("base_footprint", False),
-    ],
-)
+FRAMES = """
+camera_optical_frame | true
+cam: 1               | true
+linked               | true
+world                | false
+robot/map            | false
+camera_link          | false
+base_footprint       | false
+"""
+
+
+@pytest.mark.parametrize(("frame", "is_optical"), text_table(FRAMES))
 def test_a_start_in_another_frame_than_the_optical_one_is_refused(tmp_path, frame, is_optical):
     write_ros(tmp_path, DOCUMENT, frame=frame)
     if is_optical:

@@ -5,6 +5,7 @@ import zipfile
 import trimesh
 
 BOX = trimesh.creation.box((30.0, 20.0, 10.0))
+SMALL = trimesh.creation.box((3.0, 2.0, 1.0))
 ITEM = '<item objectid="1"/>'
 
 

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 
 from curvireg_torch.errors import MeshError
 from tests._support.refusals import refused
+from tests._support.tables import text_table
 from tests.formats.meshes.pictures import encoded
 
 BOX = trimesh.creation.box((3.0, 2.0, 1.0))
@@ -98,8 +100,7 @@ def textured(more, material=None):
 
 
 def coordinates(mesh):
-    colours = mesh.colours
-    return colours.uv[0] * [1, -1] + [0, 1]  # from the top left, as in glTF
+    return mesh.colours.uv[0] * [1, -1] + [0, 1]  # from the top left, as in glTF
 
 
 def test_strips_have_all_their_faces_and_lines_none(read):
@@ -147,26 +148,26 @@ def test_sparse_accessors_replace_some_of_their_values(read, kind):
     expected[moved] *= 3.0
     mesh, texts = read(tree)
     assert not texts
-    np.testing.assert_allclose(mesh.surface.triangles, expected[BOX.faces], atol=1e-6)
+    assert_allclose(mesh.surface.triangles, expected[BOX.faces], atol=1e-6)
     del accessor["bufferView"]
     accessor["sparse"] = sparse(tree, [*range(7)], BOX.vertices[:7], kind)
     expected = np.vstack([BOX.vertices[:7], np.zeros(3)])
     mesh, _ = read(tree)
-    np.testing.assert_allclose(mesh.surface.triangles, expected[BOX.faces], atol=1e-6)
+    assert_allclose(mesh.surface.triangles, expected[BOX.faces], atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({"count": 9}, "more values than it has"),
-        ({"count": 3}, "longer than its data"),
-        ({"count": -1}, "integer >= 0"),
-        ({"values": {}}, "no data"),
-        ({"indices": {"componentType": 5121}}, "no data"),
-        ({"indices": {"componentType": 5120, "bufferView": 2}}, "does not have"),
-        ({}, "does not have"),
-    ],
-)
+SPARSE = """
+{"count": 9}                                           | more values than it has
+{"count": 3}                                           | longer than its data
+{"count": -1}                                          | integer >= 0
+{"values": {}}                                         | no data
+{"indices": {"componentType": 5121}}                   | no data
+{"indices": {"componentType": 5120, "bufferView": 2}}  | does not have
+{}                                                     | does not have
+"""
+
+
+@pytest.mark.parametrize(("changes", "match"), text_table(SPARSE))
 def test_damaged_sparse_accessors_are_refused(read, changes, match):
     tree = Tree()
     part = tree.part(BOX.faces)
@@ -193,7 +194,7 @@ def test_vertex_colours_are_multiplied_by_the_material(read, dtype, largest, fac
     assert not texts
     tint = [0.7354, 1.0, 0.0] if factor and factor[0] == 0.5 else 1.0  # 0.5 as sRGB
     expected = 255 * colours[BOX.faces][..., :3] * tint
-    np.testing.assert_allclose(found.corners, expected, atol=1.0)
+    assert_allclose(found.corners, expected, atol=1.0)
 
 
 @pytest.mark.parametrize(
@@ -213,7 +214,7 @@ def test_texture_coordinates_are_transformed(read, transform, expected, said):
     tree.content[said] = ["KHR_texture_transform"]
     mesh, texts = read(tree)
     assert not texts
-    np.testing.assert_allclose(coordinates(mesh), expected, atol=1e-6)
+    assert_allclose(coordinates(mesh), expected, atol=1e-6)
 
 
 def test_a_texture_without_coordinates_or_format_is_named(read):
@@ -241,7 +242,7 @@ def test_quantised_positions_and_places_of_nodes(read):
         {"mesh": 0, "rotation": [0, 0, quarter, quarter]},
     ]
     mesh, _ = read(tree)
-    np.testing.assert_allclose(mesh.bounds, [[9, -1.5, -0.5], [11, 1.5, 0.5]], atol=1e-5)
+    assert_allclose(mesh.bounds, [[9, -1.5, -0.5], [11, 1.5, 0.5]], atol=1e-5)
 
 
 def test_morph_targets_are_named(read):
@@ -251,17 +252,16 @@ def test_morph_targets_are_named(read):
     assert "morph targets are left out" in read(tree)[1][0]
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"skins": [{"joints": [7]}]},
-        {"materials": [{"pbrMetallicRoughness": {"baseColorFactor": [1, 2]}}]},
-        {"materials": [{"pbrMetallicRoughness": {"baseColorFactor": "red"}}]},
-        {"materials": []},
-        {"nodes": [{"mesh": 0, "rotation": [1, 0]}]},
-        {"nodes": [{"mesh": 3}]},
-    ],
-)
+DAMAGED = """\
+{"skins": [{"joints": [7]}]}
+{"materials": [{"pbrMetallicRoughness": {"baseColorFactor": [1, 2]}}]}
+{"materials": [{"pbrMetallicRoughness": {"baseColorFactor": "red"}}]}
+{"materials": []}
+{"nodes": [{"mesh": 0, "rotation": [1, 0]}]}
+{"nodes": [{"mesh": 3}]}"""
+
+
+@pytest.mark.parametrize("change", [json.loads(row) for row in DAMAGED.split("\n")])
 def test_damaged_trees_are_refused(read, change):
     tree = Tree()
     part = tree.part(BOX.faces, material=0)

@@ -18,6 +18,7 @@ from curvireg_torch.formats.xml_files import read_xml
 from curvireg_torch.utils.extras import is_installed
 from curvireg_torch.utils.programs import run_program
 from tests._support.refusals import refused
+from tests._support.spies import spied
 from tests.formats.meshes.packages import threemf as write_package
 from tests.formats.meshes.pictures import encoded, painted
 from tests.formats.meshes.step import step_file
@@ -31,18 +32,10 @@ PICTURE = painted((200, 100, 50))
 
 def resolved(monkeypatch, path):
     """How many paths are resolved while a mesh is read."""
-    resolve = Path.resolve
-    count = 0
-
-    def counted(self, strict=False):
-        nonlocal count
-        count += 1
-        return resolve(self, strict)
-
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "resolve", counted)
+        calls = spied(patch, Path, "resolve")
         files.read_source(MeshSource(path))
-    return count
+    return len(calls)
 
 
 def peak(path):
@@ -159,14 +152,7 @@ def test_bytes_of_a_shared_image_are_made_once(tmp_path, monkeypatch):
     views = [*tree()["bufferViews"], {"buffer": 1, "byteLength": len(PICTURE)}]
     decode = Mock(wraps=gltf._data_of)
     monkeypatch.setattr(gltf, "_data_of", decode)
-    view = gltf._File._view
-    viewed = []
-
-    def noted(self, index):
-        viewed.append(index)
-        return view(self, index)
-
-    monkeypatch.setattr(gltf._File, "_view", noted)
+    viewed = spied(monkeypatch, gltf._File, "_view")
     path = tmp_path / "a.gltf"
     for count in (5, 10):
         decode.reset_mock()
@@ -178,22 +164,21 @@ def test_bytes_of_a_shared_image_are_made_once(tmp_path, monkeypatch):
         shared = part_of_image(count, {"bufferView": 1}, buffers=buffers, bufferViews=views)
         path.write_text(json.dumps(shared))
         assert len(cr.load_mesh(path).colours.textures) == 1
-        assert viewed.count(1) == 1
+        assert [index for _, index in viewed].count(1) == 1
 
 
 def test_joints_of_a_skin_are_placed_once(tmp_path, monkeypatch):
-    joints = Mock(wraps=gltf._File._joints)
+    joints = spied(monkeypatch, gltf._File, "_joints")
     placed = Mock(wraps=np.stack)
     whole = skinned([0] * 4, [1, 0, 0, 0], {"translation": [0, 0, 2]})
     whole.content["nodes"] += [{"mesh": 0, "skin": 0}] * 19
     whole.content["scenes"] = [{"nodes": list(range(21))}]
-    monkeypatch.setattr(gltf._File, "_joints", lambda self, index: joints(self, index))
     monkeypatch.setattr(gltf.np, "stack", placed)
     monkeypatch.setattr(gltf, "SKINNED_AT_ONCE", 2)  # blocks of one part
     found = files.read_source(MeshSource(whole.write(tmp_path / "a.gltf")))
     assert (found.vertices[:, 2] == 2.0).all()
     assert found.vertices[:3].tolist() == [[0, 0, 2], [1, 0, 2], [0, 1, 2]]
-    assert (joints.call_count, placed.call_count) == (20, 1)
+    assert (len(joints), placed.call_count) == (20, 1)
     whole.content["skins"] = [{"joints": [1] * 100_001}]
     with refused("more than 100,000 joints", MeshError):
         cr.load_mesh(whole.write(tmp_path / "a.gltf"))
@@ -254,17 +239,10 @@ def test_a_texture_of_many_groups_is_unpacked_once(tmp_path, monkeypatch):
     mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
     resources = f'<texture2d id="7" path="/3D/a.png"/>{groups}<object id="1">{mesh}</object>'
     path = write_package(tmp_path / "a.3mf", resources, more={"3D/a.png": PICTURE})
-    content = threemf._Package._content
-    asked = []
-
-    def noted(self, name):
-        asked.append(name)
-        return content(self, name)
-
-    monkeypatch.setattr(threemf._Package, "_content", noted)
+    asked = spied(monkeypatch, threemf._Package, "_content")
     found = files.read_source(MeshSource(path)).colours
     assert len(found.textures) == 1
-    assert asked.count("/3D/a.png") == 1
+    assert [name for _, name in asked].count("/3D/a.png") == 1
     monkeypatch.setitem(threemf._MOST, "triangle", 9)
     with refused("more than 9 of 'triangle'", MeshError):
         cr.load_mesh(path)

@@ -11,6 +11,7 @@ from curvireg_torch.cli.options import MESH, add_options, register_options
 from curvireg_torch.errors import MeshError, MissingFileError
 from curvireg_torch.mesh import mesh_symmetries
 from tests._support.refusals import refused
+from tests._support.tables import text_table
 from tests.formats.meshes.pictures import encoded, noise
 
 POINTS = "".join(f"v {x} {y} {z}\n" for x in (0, 3) for y in (0, 2) for z in (0, 1))
@@ -81,20 +82,20 @@ def test_materials_of_all_libraries_and_none_without_a_name(write, load):
     assert (colours.corners[6:] == 255).all(), "no name: no material"
 
 
-@pytest.mark.parametrize(
-    ("options", "scale", "offset"),
-    [
-        ("", (1, 1), (0, 0)),
-        ("-s 1.000000 1.000000 1.000000", (1, 1), (0, 0)),
-        ("-s 2 3 -o 0.25 0.5 0", (2, 3), (0.25, 0.5)),
-        ("-s\t2\t3\t1\t", (2, 3), (0, 0)),
-        ("-s 3", (3, 1), (0, 0)),
-        ("-s 3 5 7", (3, 5), (0, 0)),
-        ("-o 3 5 -s 2", (2, 1), (3, 5)),
-        ("-o .5 -bm 1.5 -clamp on", (1, 1), (0.5, 0)),
-        ("-blendu on -blendv off -mm 0 1 -texres 512 -imfchan l -t 1 1 1", (1, 1), (0, 0)),
-    ],
-)
+TEXTURE_OPTIONS = """
+                                                               | [1, 1] | [0, 0]
+-s 1.000000 1.000000 1.000000                                  | [1, 1] | [0, 0]
+-s 2 3 -o 0.25 0.5 0                                           | [2, 3] | [0.25, 0.5]
+"-s\\t2\\t3\\t1\\t"                                           | [2, 3] | [0, 0]
+-s 3                                                           | [3, 1] | [0, 0]
+-s 3 5 7                                                       | [3, 5] | [0, 0]
+-o 3 5 -s 2                                                    | [2, 1] | [3, 5]
+-o .5 -bm 1.5 -clamp on                                        | [1, 1] | [0.5, 0]
+-blendu on -blendv off -mm 0 1 -texres 512 -imfchan l -t 1 1 1 | [1, 1] | [0, 0]
+"""
+
+
+@pytest.mark.parametrize(("options", "scale", "offset"), text_table(TEXTURE_OPTIONS))
 @pytest.mark.parametrize(
     "name",
     ["label.png", "my label.png", "LABEL.PNG", '"label.png"', "maps\\label.png", "./label.png"],
@@ -164,21 +165,21 @@ def test_corners_of_several_forms_in_one_file(write, load):
     np.testing.assert_array_equal(mesh.faces, plain.faces)
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("v 1 2", "a vertex has fewer than 3 coordinates"),
-        ("v 0,5 1,0 2,0", "decimal commas"),
-        ("v a b c", "a coordinate is not a number"),
-        ("f 1 2 9", "a vertex that the file lacks"),
-        ("f 1 2 -99", "a vertex that the file lacks"),
-        ("f 1/9 2/9 3/9", "that the file lacks"),
-        ("f 0 1 2", "vertex 0; OBJ files count from 1"),
-        ("f 1 2 0", "vertex 0; OBJ files count from 1"),
-        ("f 3/1/1 0/1/1 1/1/1", "vertex 0; OBJ files count from 1"),
-        ("f 0 1 2 3", "vertex 0; OBJ files count from 1"),
-    ],
-)
+DAMAGED = """
+v 1 2               | a vertex has fewer than 3 coordinates
+v 0,5 1,0 2,0       | decimal commas
+v a b c             | a coordinate is not a number
+f 1 2 9             | a vertex that the file lacks
+f 1 2 -99           | a vertex that the file lacks
+f 1/9 2/9 3/9       | that the file lacks
+f 0 1 2             | vertex 0; OBJ files count from 1
+f 1 2 0             | vertex 0; OBJ files count from 1
+f 3/1/1 0/1/1 1/1/1 | vertex 0; OBJ files count from 1
+f 0 1 2 3           | vertex 0; OBJ files count from 1
+"""
+
+
+@pytest.mark.parametrize(("line", "words"), text_table(DAMAGED))
 def test_damaged_lines_are_refused(refused, line, words):
     refused("a.obj", f"{BOX}vt 0 0\n{line}\n", rf"a\.obj: cannot be read as a mesh .*{words}")
 

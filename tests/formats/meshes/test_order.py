@@ -9,6 +9,7 @@ from io import BytesIO
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose
 from PIL import Image
 
 import curvireg_torch as cr
@@ -18,11 +19,12 @@ from curvireg_torch.formats.meshes.polygons import triangulated
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, colour_bytes
 from curvireg_torch.mesh.colours import colours_of_parts
 from curvireg_torch.utils.extras import is_installed
+from tests._support.tables import text_table
 from tests.formats.meshes.packages import solid, threemf
 from tests.formats.meshes.pictures import painted
 from tests.formats.meshes.test_gltf import TRIANGLE, Tree, coordinates, skinned, textured
 from tests.formats.meshes.test_ply import header, rows
-from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, square, stage
+from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, square, stage, write_print
 
 needs_usd = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
 pytestmark = pytest.mark.usefixtures("here")
@@ -37,8 +39,7 @@ QUARTER = [0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 
 def first_corners(mesh):
     """The colours of the first corner of each face."""
-    colours = mesh.colours
-    return colours.corners[:, 0].tolist()
+    return mesh.colours.corners[:, 0].tolist()
 
 
 def textures(mesh):
@@ -75,7 +76,7 @@ def test_a_node_is_scaled_then_turned_then_moved_in_the_frame_of_its_parent(
     tree.part(None, TRIANGLE)
     tree.content["nodes"] = nodes
     mesh = loaded(tree)
-    np.testing.assert_allclose(mesh.vertices, expected, atol=1e-6)
+    assert_allclose(mesh.vertices, expected, atol=1e-6)
 
 
 def test_a_joint_moves_what_its_inverse_bind_matrix_has_moved(loaded):
@@ -83,7 +84,7 @@ def test_a_joint_moves_what_its_inverse_bind_matrix_has_moved(loaded):
     bind[3, 0] = 4.0  # by column: a shift along x
     tree = skinned([0] * 4, [1, 0, 0, 0], {"rotation": QUARTER}, inverseBindMatrices=bind)
     mesh = loaded(tree)
-    np.testing.assert_allclose(mesh.vertices, [[0, 4, 0], [0, 5, 0], [-1, 4, 0]], atol=1e-6)
+    assert_allclose(mesh.vertices, [[0, 4, 0], [0, 5, 0], [-1, 4, 0]], atol=1e-6)
 
 
 def test_joints_stand_in_the_frames_of_their_parents(loaded):
@@ -99,13 +100,13 @@ def test_joints_stand_in_the_frames_of_their_parents(loaded):
     tree.content["scenes"] = [{"nodes": [0, 1, 3]}]
     mesh = loaded(tree)
     expected = [[0, 5, 0], [3, 5, 0], [2, 6, 0], *TRIANGLE]
-    np.testing.assert_allclose(mesh.vertices, expected, atol=1e-6)
+    assert_allclose(mesh.vertices, expected, atol=1e-6)
 
 
 def test_weights_of_joints_are_shares(loaded):
     tree = skinned([0, 1, 0, 0], [3, 1, 0, 0], {}, {"translation": [0, 0, 4]})
     mesh = loaded(tree)
-    np.testing.assert_allclose(mesh.vertices, np.add(TRIANGLE, [0, 0, 1]), atol=1e-6)
+    assert_allclose(mesh.vertices, np.add(TRIANGLE, [0, 0, 1]), atol=1e-6)
 
 
 def test_the_least_integer_of_a_fraction_is_minus_one(loaded):
@@ -244,7 +245,7 @@ def test_a_component_lies_in_the_frame_of_a_turned_item(read_3mf):
     resources = solid(1) + f'<object id="2"><components>{component}</components></object>'
     item = f'<item objectid="2" transform="{turn} 0 0 7"/>'
     mesh, _ = read_3mf(resources, item)
-    np.testing.assert_allclose(mesh.bounds, [[-10, 85, 2], [10, 115, 12]])
+    assert_allclose(mesh.bounds, [[-10, 85, 2], [10, 115, 12]])
 
 
 def test_the_model_in_its_usual_place_is_the_first(tmp_path, load):
@@ -290,17 +291,17 @@ def test_roll_comes_before_pitch_before_yaw(tmp_path, load):
     origin = f'<origin rpy="{half} 0 {half}" xyz="10 0 0"/>'
     mesh, _ = load(robot(tmp_path, wedge(tmp_path) + origin))
     # roll takes y to z and z to -y, yaw x to y and y to -x: (1, 4, 3) -> (3, 1, 4)
-    np.testing.assert_allclose(mesh.bounds, [[10, 0, 0], [13, 1, 4]], atol=1e-6)
+    assert_allclose(mesh.bounds, [[10, 0, 0], [13, 1, 4]], atol=1e-6)
     origin = f'<origin rpy="0 {half} {half}"/>'
     mesh, _ = load(robot(tmp_path, wedge(tmp_path) + origin))
     # pitch takes x to -z and z to x
-    np.testing.assert_allclose(mesh.bounds, [[-4, 0, -1], [0, 3, 0]], atol=1e-6)
+    assert_allclose(mesh.bounds, [[-4, 0, -1], [0, 3, 0]], atol=1e-6)
 
 
 def test_a_visual_lies_in_its_link_and_that_at_its_joint(tmp_path, load):
     joint = f'<origin rpy="0 0 {math.pi / 2}" xyz="0 0 5"/>'
     mesh, _ = load(robot(tmp_path, wedge(tmp_path) + '<origin xyz="10 0 0"/>', joint))
-    np.testing.assert_allclose(mesh.bounds, [[-4, 10, 5], [0, 11, 8]], atol=1e-6)
+    assert_allclose(mesh.bounds, [[-4, 10, 5], [0, 11, 8]], atol=1e-6)
 
 
 def test_a_colour_of_a_visual_wins_over_a_named_one(tmp_path, load):
@@ -346,13 +347,12 @@ def test_a_part_of_usd_lies_in_the_frame_of_its_parent(write, load):
     place = "    double3 xformOp:rotateXYZ = (0, 0, 90)\n"
     place += '    uniform token[] xformOpOrder = ["xformOp:rotateXYZ"]\n'
     mesh, _ = load(write("a.usda", stage(inner, place=place)))
-    np.testing.assert_allclose(mesh.bounds, [[-1, 5, 0], [0, 7, 0]], atol=1e-6)
+    assert_allclose(mesh.bounds, [[-1, 5, 0], [0, 7, 0]], atol=1e-6)
 
 
 @needs_usd
 def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path, write, load):
-    (tmp_path / "textures").mkdir()
-    (tmp_path / "textures" / "print.png").write_bytes(painted((255, 0, 0)))
+    write_print(tmp_path, painted((255, 0, 0)))
     colour = 'color3f[] primvars:displayColor = [(0, 1, 0)] (interpolation = "constant")\n        '
     plain = square(colour).replace('"square"', '"plain"')
     mesh, _ = load(write("a.usda", stage(MATERIAL, square(colour + MAP, BOUND), plain)))
@@ -374,7 +374,7 @@ def test_faces_keep_their_side_and_convex_ones_are_fans(order, signs):
         area = 0.5 * np.cross(tilted, np.roll(tilted, -1, axis=0)).sum(axis=0)
         faces, owner = triangulated(tilted, np.arange(len(tilted)), np.array([len(tilted)]))
         a, b, c = tilted[faces].transpose(1, 0, 2)
-        np.testing.assert_allclose(0.5 * np.cross(b - a, c - a).sum(axis=0), area, atol=1e-9)
+        assert_allclose(0.5 * np.cross(b - a, c - a).sum(axis=0), area, atol=1e-9)
         sides = np.cross(b - a, c - a) @ area
         assert (sides > 0).all()
         assert (owner == 0).all()
@@ -404,21 +404,21 @@ def test_transparent_texels_are_white():
     assert (pixels[0, 0].tolist(), count) == ([244, 204, 204], 4)
 
 
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        ([0.0, 0.5, 1.0], [0, 128, 255]),
-        ([0.2, 0.5, 1.0024], [51, 128, 255]),
-        ([0.2, 0.5, math.inf], [51, 128, 255]),
-        ([0.2, 0.5, math.nan], [51, 128, 0]),
-        ([0.0, 1.0, 1.0], [0, 255, 255]),
-        ([0.0, 1.0, 2.0], [0, 1, 2]),
-        ([0.0, 51.5, 254.9], [0, 52, 255]),
-        ([0.5, 20.5, 300.0], [0, 20, 255]),
-        ([-1.0, 0.5, 0.5], [0, 128, 128]),
-        ([0.0, 0.0, 0.0], [0, 0, 0]),
-    ],
-)
+COLOURS = """
+[0.0, 0.5, 1.0]      | [0, 128, 255]
+[0.2, 0.5, 1.0024]   | [51, 128, 255]
+[0.2, 0.5, Infinity] | [51, 128, 255]
+[0.2, 0.5, NaN]      | [51, 128, 0]
+[0.0, 1.0, 1.0]      | [0, 255, 255]
+[0.0, 1.0, 2.0]      | [0, 1, 2]
+[0.0, 51.5, 254.9]   | [0, 52, 255]
+[0.5, 20.5, 300.0]   | [0, 20, 255]
+[-1.0, 0.5, 0.5]     | [0, 128, 128]
+[0.0, 0.0, 0.0]      | [0, 0, 0]
+"""
+
+
+@pytest.mark.parametrize(("values", "expected"), text_table(COLOURS))
 def test_colours_are_fractions_or_bytes(values, expected):
     assert colour_bytes(np.array(values)).tolist() == expected
 
@@ -491,7 +491,7 @@ def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path, load):
     shape = '<geometry><mesh filename="a.3mf"/></geometry>'
     mesh, _ = load(robot(tmp_path, shape))
     assert mesh.unit == "m"
-    np.testing.assert_allclose(mesh.extents, [0.03, 0.02, 0.01])
+    assert_allclose(mesh.extents, [0.03, 0.02, 0.01])
 
 
 def test_colours_of_a_material_in_memory():

@@ -32,9 +32,8 @@ def test_colours_under_every_name(write, load, prefix, short, kind, scale):
     vertex = "".join(f"property {kind} {name}\n" for name in names)
     extra = [" ".join(f"{shade * scale:g}" for shade in shades) for shades in SHADES]
     mesh, texts = load(write("a.ply", header(vertex, "") + rows(extra) + "3 0 1 2\n3 0 2 3\n"))
-    colours = mesh.colours
     assert not texts
-    np.testing.assert_array_equal(colours.corners, np.array(SHADES)[mesh.faces])
+    np.testing.assert_array_equal(mesh.colours.corners, np.array(SHADES)[mesh.faces])
 
 
 def pictures(folder):

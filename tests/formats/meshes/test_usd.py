@@ -4,6 +4,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
@@ -69,11 +70,16 @@ def stage(*parts, about='metersPerUnit = 0.001\n    upAxis = "Z"', place=""):
 
 
 def textures_of(mesh):
-    colours = mesh.colours
-    return [texture[0, 0].tolist() for texture in colours.textures]
+    return [texture[0, 0].tolist() for texture in mesh.colours.textures]
 
 
 RED_ON_BLUE = encoded([[[255, 0, 0]] * 8] * 4 + [[[0, 0, 255]] * 8] * 4)
+
+
+def write_print(folder, picture):
+    """The texture of ``MATERIAL``."""
+    (folder / "textures").mkdir(parents=True)
+    (folder / "textures" / "print.png").write_bytes(picture)
 
 
 def package(path, text, **more):
@@ -97,11 +103,11 @@ def test_places_units_axes_and_polygons(tmp_path, load):
     path.write_text(stage(square(), place=place))
     mesh, texts = load(path)
     assert (mesh.unit, mesh.up, texts) == ("mm", "z", [])
-    np.testing.assert_allclose(mesh.bounds, [[10, 0, 5], [12, 0, 6]], atol=1e-6)
-    np.testing.assert_allclose(mesh.surface.face_normals, [[0, -1, 0]] * 2, atol=1e-6)
+    assert_allclose(mesh.bounds, [[10, 0, 5], [12, 0, 6]], atol=1e-6)
+    assert_allclose(mesh.surface.face_normals, [[0, -1, 0]] * 2, atol=1e-6)
     assert not mesh.has_colours
     path.write_text(stage(square('uniform token orientation = "leftHanded"'), place=place))
-    np.testing.assert_allclose(load(path)[0].surface.face_normals, [[0, 1, 0]] * 2, atol=1e-6)
+    assert_allclose(load(path)[0].surface.face_normals, [[0, 1, 0]] * 2, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -126,8 +132,7 @@ def test_colours_of_the_mesh(write, load):
     more = colours + ' (interpolation = "uniform")'
     path = write("part.usda", stage(square(more, counts="3, 3", indices="0, 1, 2, 0, 2, 3")))
     mesh, _ = load(path)
-    found = mesh.colours
-    assert found.corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
+    assert mesh.colours.corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
     assert mesh.has_colours
 
 
@@ -137,8 +142,7 @@ def test_textures_by_the_coordinates_that_they_name(tmp_path, load, kind):
     path = tmp_path / f"part.{kind}"
     if kind == "usda":
         path.write_text(text)
-        (tmp_path / "textures").mkdir()
-        (tmp_path / "textures" / "print.png").write_bytes(RED_ON_BLUE)
+        write_print(tmp_path, RED_ON_BLUE)
         assert mesh_files(path) == [path, tmp_path / "textures" / "print.png"]
     else:
         package(path, text, textures__print_png=RED_ON_BLUE)
@@ -159,8 +163,7 @@ def test_textures_by_the_coordinates_that_they_name(tmp_path, load, kind):
 def test_textures_lie_beside_the_file_that_names_them(tmp_path, write, load):
     """A file of the same name beside the first one is another texture."""
     for folder, colour in ((".", (255, 0, 0)), ("blue", (0, 0, 255))):
-        (tmp_path / folder / "textures").mkdir(parents=True)
-        (tmp_path / folder / "textures" / "print.png").write_bytes(painted(colour))
+        write_print(tmp_path / folder, painted(colour))
     # without ./ OpenUSD looks beside the first file too
     material = MATERIAL.replace("@textures", "@./textures")
     text = stage(material, square(MAP, BOUND), about='defaultPrim = "part"')
@@ -191,8 +194,7 @@ def test_a_texture_whose_file_is_an_input_of_the_material(write, load):
 
 
 def test_textures_are_scaled(tmp_path, load):
-    (tmp_path / "textures").mkdir()
-    (tmp_path / "textures" / "print.png").write_bytes(painted((255, 255, 255)))
+    write_print(tmp_path, painted((255, 255, 255)))
     path = tmp_path / "part.usda"
     for more, tint, count in (
         ("float4 inputs:scale = (0.2158605, 1, 0, 1)", [128, 255, 0], 0),
@@ -203,8 +205,7 @@ def test_textures_are_scaled(tmp_path, load):
         path.write_text(stage(scaled, square(MAP, BOUND)))
         mesh, texts = load(path)
         assert len(texts) == count
-        colours = mesh.colours
-        assert colours.corners[0, 0].tolist() == tint
+        assert mesh.colours.corners[0, 0].tolist() == tint
 
 
 def test_references_stay_in_the_folder(tmp_path, write, load):
