@@ -4,6 +4,7 @@ import torch
 import trimesh
 
 from curvireg_torch import camera_matrix
+from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.registration import fit_contours
@@ -31,6 +32,11 @@ CUBE_POSE = pose([0.4, 0.5, 0.1], [0.0, 0.0, 8.0])
 def silhouette(mesh, T):
     """(1, 128, 128) white object on black."""
     return (make_renderer(mesh).render(T[None], K, (128, 128))[0] > 0).float()
+
+
+def cube_crops(mask=None):
+    """The silhouette of the cube in its pose."""
+    return EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1, mask)
 
 
 def noise():

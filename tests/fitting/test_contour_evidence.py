@@ -10,6 +10,7 @@ from curvireg_torch.fitting.measured_fit import contour_evidence, contour_suppor
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.rendering.contours import MeshContours
 from tests._support import double, eye, seeded
+from tests.rendering.test_creases import strip
 
 K = double([[4000.0, 0.0, 99.5], [0.0, 4000.0, 99.5], [0.0, 0.0, 1.0]])
 FRONT = transform(eye(3), double([0.0, 0.0, 40.0]))
@@ -24,10 +25,7 @@ def roof(*, ridges=1):
     """The plate with ridges towards the camera, which are creases within the outline."""
     x = np.linspace(-0.5, 0.5, 2 * ridges + 1)
     z = np.where(np.arange(len(x)) % 2 == 1, -0.4 / ridges, 0.0)
-    rows = [np.stack([x, np.full_like(x, y), z], axis=1) for y in (-0.5, 0.5)]
-    n = len(x)
-    faces = [face for k in range(n - 1) for face in ((k, n + k, k + 1), (k + 1, n + k, n + k + 1))]
-    return trimesh.Trimesh(np.concatenate(rows), faces, process=False)
+    return strip(x, z)
 
 
 def photograph(*, line=0.0, noise=0.0):

@@ -8,7 +8,6 @@ import torch.nn.functional as F
 from torch.testing import assert_close
 
 from curvireg_torch import camera_matrix, rotation_error
-from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.fitting import contour_fit
 from curvireg_torch.fitting.contour_fit import fit_to_edges, short_fit
 from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
@@ -22,8 +21,8 @@ from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.terms import crop_photographs
-from tests._support import double, eye, seeded, slow_after
-from tests.fitting.cube import BOX, CUBE_POSE, K, cube, fitted, noise, pose, silhouette
+from tests._support import double, eye, refused, seeded, slow_after
+from tests.fitting.cube import BOX, CUBE_POSE, K, cube, cube_crops, fitted, noise, pose, silhouette
 
 CENTRE = double([0.2, -0.1, 0.3])
 T = pose([0.3, -0.5, 0.2], [0.1, 0.2, 6.0])[None]
@@ -280,7 +279,7 @@ def test_a_fit_begins_around_its_start_and_farther_away_if_it_is_a_second_one(mo
         return promising(half, around, count)
 
     monkeypatch.setattr(contour_fit, "_promising", watched)
-    crops = EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1)
+    crops = cube_crops()
     T = CUBE_POSE[None]
     for refit in (False, True):
         fit_to_edges(MeshContours(cube()), crops, K[None], T, FIRST, short_fits=T, refit=refit)
@@ -381,9 +380,7 @@ def test_start_support_is_at_full_size_and_trustworthy_depends_on_support_or_gai
     off = double([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]])
     start = apply_twist(CUBE_POSE[None], off, mesh_centre(cube()))
     image = silhouette(cube(), CUBE_POSE)
-    expected = contour_support(
-        MeshContours(cube()), EdgeCrops.cut([image], BOX[None], 0.1), K[None], start, FIRST
-    )
+    expected = contour_support(MeshContours(cube()), cube_crops(), K[None], start, FIRST)
     fit = fitted(image, start)
     assert_close(fit.start_support, expected)
     assert fit.trustworthy
@@ -406,16 +403,15 @@ def test_fit_rejects_bad_input():
         (CUBE_POSE[None], {"object_mask": torch.ones(2, 1, 8, 8)}, "object_mask"),
         (CUBE_POSE[None], {"image_index": torch.tensor([1])}, "image_index: expected"),
     ):
-        with pytest.raises(InvalidInputError, match=message):
+        with refused(message):
             fitted(noise(), start, **options)
 
 
 def test_a_short_fit_reaches_far_and_counts_the_mask():
     """At a quarter of the size, edges are found from 28 px beside them, which a fit at full size
     does not reach."""
-    image = silhouette(cube(), CUBE_POSE)
     contours = MeshContours(cube())
-    crops = EdgeCrops.cut([image], BOX[None], 0.1)
+    crops = cube_crops()
     crop = ContourProblem.of(contours, crops, K[None])
     focal = float(crop.K[0, 0, 0])
     depth = float((CUBE_POSE[:3, :3] @ mesh_centre(cube()) + CUBE_POSE[:3, 3])[2])
@@ -425,13 +421,10 @@ def test_a_short_fit_reaches_far_and_counts_the_mask():
         1
     ].tolist()
     assert far > 0.95 * right
+    image = silhouette(cube(), CUBE_POSE)
     inside = crop_photographs([image], BOX[None], size=64, margin=0.1)[:, :1].clamp(0, 1)
     with_mask, against = (
-        float(
-            short_fit(
-                contours, EdgeCrops.cut([image], BOX[None], 0.1, mask), K[None], CUBE_POSE[None]
-            )[1]
-        )
+        float(short_fit(contours, cube_crops(mask), K[None], CUBE_POSE[None])[1])
         for mask in (inside, 1.0 - inside)
     )
     assert with_mask > 1.5 * against
@@ -439,11 +432,9 @@ def test_a_short_fit_reaches_far_and_counts_the_mask():
 
 def test_known_short_fits_change_nothing_and_fitted_poses_are_kept():
     """A pose that is fitted again moves only if fits around it end elsewhere."""
-    image = silhouette(cube(), CUBE_POSE)
     contours = MeshContours(cube())
-    crops = EdgeCrops.cut([image], BOX[None], 0.1)
     starts = apply_twist(CUBE_POSE.repeat(2, 1, 1), torch.deg2rad(eye(6)[:2] * 6), contours.centre)
-    problem = contours, crops, K.expand(2, 3, 3)
+    problem = contours, cube_crops(), K.expand(2, 3, 3)
     first = fit_to_edges(*problem, starts, FIRST.repeat(2))
     known = fit_to_edges(
         *problem, starts, FIRST.repeat(2), short_fits=short_fit(*problem, starts)[0]

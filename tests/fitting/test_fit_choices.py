@@ -7,12 +7,11 @@ from torch.testing import assert_close
 from curvireg_torch.fitting import contour_fit
 from curvireg_torch.fitting.contour_fit import COARSE_DENSITY, fit_to_edges
 from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
-from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.rendering.contours import MeshContours
 from tests._support import double, eye
-from tests.fitting.cube import BOX, CUBE_POSE, K, cube, silhouette
+from tests.fitting.cube import CUBE_POSE, K, cube, cube_crops
 
 
 def starts(*degrees):
@@ -31,10 +30,9 @@ def fitted(monkeypatch, T, weigh, **options):
         return plain, weigh(problem, state, plain)
 
     monkeypatch.setattr(ContourProblem, "supports", supports)
-    crops = EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1)
-    cameras = K.expand(len(T), 3, 3)
+    given = MeshContours(cube()), cube_crops(), K.expand(len(T), 3, 3), T
     index = torch.zeros(len(T), dtype=torch.long)
-    return fit_to_edges(MeshContours(cube()), crops, cameras, T, index, short_fits=T, **options)
+    return fit_to_edges(*given, index, short_fits=T, **options)
 
 
 def test_the_weighted_support_decides_and_the_plain_one_is_reported(monkeypatch):

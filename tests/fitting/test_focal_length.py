@@ -31,12 +31,17 @@ def near_scene():
     return image, box, T
 
 
-def fitting_problem(image, box, K, factor=1):
-    describer = truck_registrar().describer
+def near_problem(wrong=1.0):
+    """Of a focal length that is wrong by this factor; and the true pose (1, 4, 4)."""
+    image, box, T = near_scene()
+    K = focal_length.scaled_cameras(NEAR[None], double([wrong]).log())
     crops = EdgeCrops.cut([image], box[None], 0.1)
-    return ContourProblem.of(
-        describer.contours, crops, K[None], torch.zeros(1, dtype=torch.long), factor=factor
-    )
+    index = torch.zeros(1, dtype=torch.long)
+    return ContourProblem.of(truck_registrar().describer.contours, crops, K, index), T[None]
+
+
+def fit(problem, T, prior):
+    return focal_length.fit_focal_length(problem, T, prior, FULL_SIZE_RADII)
 
 
 def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
@@ -62,9 +67,8 @@ def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
 
 
 def test_derivative_by_the_focal_length():
-    image, box, T = near_scene()
-    problem = fitting_problem(image, box, NEAR)
-    T = apply_twist(T[None], double([[0.05, 0.1, 0.0, 0.02, 0.0, 0.0]]), problem.centre)
+    problem, T = near_problem()
+    T = apply_twist(T, double([[0.05, 0.1, 0.0, 0.02, 0.0, 0.0]]), problem.centre)
     state = problem.state(T)
     step = double([1e-5])
 
@@ -83,16 +87,12 @@ def test_derivative_by_the_focal_length():
 
 @pytest.mark.parametrize("wrong", [0.75, 1.35])
 def test_strong_perspective_shows_the_focal_length(wrong):
-    image, box, T = near_scene()
-    guess = focal_length.scaled_cameras(NEAR[None], double([wrong]).log())[0]
-    problem = fitting_problem(image, box, guess)
-    start = focal_length.moved_away(T[None], double([wrong]).log(), problem.centre)
-    fit = focal_length.fit_focal_length(
-        problem, start, focal_length.FocalPrior.usual(guess[None], SIZE), FULL_SIZE_RADII
-    )
-    assert wrong * float(fit.log_zoom.exp()) == pytest.approx(1.0, abs=0.06)
-    assert rotation_error(fit.state.T[0, :3, :3], T[:3, :3]) < 1.5
-    information, _ = focal_length.focal_information(fit.problem, fit.state, 2.0)
+    problem, T = near_problem(wrong)
+    start = focal_length.moved_away(T, double([wrong]).log(), problem.centre)
+    found = fit(problem, start, focal_length.FocalPrior.usual(wrong * NEAR[None].double(), SIZE))
+    assert wrong * float(found.log_zoom.exp()) == pytest.approx(1.0, abs=0.06)
+    assert rotation_error(found.state.T[0, :3, :3], T[0, :3, :3]) < 1.5
+    information, _ = focal_length.focal_information(found.problem, found.state, 2.0)
     assert information.variance.sqrt() < 0.2
 
 
@@ -104,28 +104,22 @@ def test_strong_perspective_shows_the_focal_length(wrong):
     ],
 )
 def test_a_narrow_prior_or_a_limit_holds_the_focal_length(deviation, limit, is_moved, expected):
-    image, box, T = near_scene()
-    wrong = double([1.35]).log()
-    problem = fitting_problem(image, box, focal_length.scaled_cameras(NEAR[None], wrong)[0])
+    problem, T = near_problem(1.35)
     none = torch.zeros(1, dtype=torch.float64)
     prior = focal_length.FocalPrior(none, deviation, none - limit, none + limit)
-    start = focal_length.moved_away(T[None], wrong, problem.centre) if is_moved else T[None]
-    fit = focal_length.fit_focal_length(problem, start, prior, FULL_SIZE_RADII)
-    assert float(fit.log_zoom) == expected
+    start = focal_length.moved_away(T, double([1.35]).log(), problem.centre) if is_moved else T
+    assert float(fit(problem, start, prior).log_zoom) == expected
 
 
 def test_the_pull_of_a_prior_does_not_grow_beyond_its_reach():
     """A prior far away pulls as far as one at its reach."""
-    image, box, T = near_scene()
-    problem = fitting_problem(image, box, NEAR)
+    problem, T = near_problem()
     gap = double([2.0])
     wide = gap + 5.0
 
     def zoom(**changes):
         prior = replace(focal_length.FocalPrior(gap, 0.2, -wide, wide, 0.05), **changes)
-        return float(
-            focal_length.fit_focal_length(problem, T[None], prior, FULL_SIZE_RADII).log_zoom
-        )
+        return float(fit(problem, T, prior).log_zoom)
 
     bounded = zoom()
     assert 0.0 < bounded < 0.5 * zoom(reach=float("inf"))
@@ -137,19 +131,16 @@ def test_the_pull_of_a_prior_does_not_grow_beyond_its_reach():
 
 def test_a_focal_length_moves_by_steps():
     """Of a quarter of log f, whatever pulls: six in three rounds."""
-    image, box, T = near_scene()
-    problem = fitting_problem(image, box, NEAR)
+    problem, T = near_problem()
     gap = double([5.0])
     prior = focal_length.FocalPrior(gap, 1e-3, -2.0 * gap, 2.0 * gap)
-    fit = focal_length.fit_focal_length(problem, T[None], prior, FULL_SIZE_RADII)
-    assert 1.0 < float(fit.log_zoom) <= 1.5 + 1e-9
+    assert 1.0 < float(fit(problem, T, prior).log_zoom) <= 1.5 + 1e-9
 
 
 def test_errors_of_edges_belong_together(monkeypatch):
     """The variance of log f is sixteen times that of independent errors."""
-    image, box, T = near_scene()
-    problem = fitting_problem(image, box, NEAR)
-    state = problem.state(T[None])
+    problem, T = near_problem()
+    state = problem.state(T)
     found, _ = focal_length.focal_information(problem, state, 2.0)
     monkeypatch.setattr(focal_length, "FOCAL_SCALE", 1.0)
     independent, _ = focal_length.focal_information(problem, state, 2.0)

@@ -77,7 +77,7 @@ def registrar_of(**views):
     return made
 
 
-def pose(azimuth, x, z):
+def pose(azimuth, x=0.4, z=4.0):
     R = rotation_from_viewpoint(azimuth, 25.0, 10.0).double()
     return transform(R, double([x, 0.1, z]))
 
@@ -92,6 +92,11 @@ def photograph(*poses, shown=None):
     return (image + 0.02 * noise).clamp(0, 1)
 
 
+def answer(registrar, T, **options):
+    """The registration of a photograph of the carton at T."""
+    return registrar([photograph(T)], box_of(T)[None], K, **options)[0]
+
+
 def box_of(T):
     return projected_boxes(extreme_points(mesh()), T[None], K)[0].float()
 
@@ -99,7 +104,7 @@ def box_of(T):
 @pytest.mark.parametrize("azimuth", slow_after(1, [20.0, 130.0, 250.0]))
 @pytest.mark.parametrize("with_box", [True, False])
 def test_pose_is_that_of_the_print(azimuth, with_box):
-    T = pose(azimuth, 0.4, 4.0)
+    T = pose(azimuth)
     box = box_of(T) if with_box else None
     found, counts = keypoints().matches(photograph(T), K, box).poses()
     assert bool((counts[1:] < 12).all())
@@ -110,7 +115,7 @@ def test_pose_is_that_of_the_print(azimuth, with_box):
 
 def test_photograph_may_be_large_and_of_any_dtype(monkeypatch):
     """Features are those of a smaller copy, in px of the photograph."""
-    T = pose(20.0, 0.4, 4.0)
+    T = pose(20.0)
     image = (255.0 * photograph(T)).round().to(torch.uint8)
     monkeypatch.setattr(keypoints_module, "MAX_SIDE", 400)
     (found,), _ = keypoints().matches(image, K).poses()
@@ -149,7 +154,7 @@ def test_each_copy_has_a_pose():
 
 
 def test_nothing_is_found_where_the_print_is_not():
-    T = pose(20.0, 0.4, 4.0)
+    T = pose(20.0)
     other = photograph(T, shown=as_mesh(carton(seed=1)))
     plain = torch.full((1, 40, 40), 0.5)
     missing = torch.full((3, 40, 40), torch.nan)
@@ -179,12 +184,11 @@ def test_keypoints_agree_with_the_poses_of_their_object():
 
 
 def test_keypoints_decide_where_most_of_the_object_is_hidden():
-    T = pose(65.0, 0.4, 4.0)
+    T = pose(65.0)
     image = photograph(T)
     box = box_of(T)
-    image[:, int(box[1] + 0.4 * (box[3] - box[1])) :] = photograph()[
-        :, int(box[1] + 0.4 * (box[3] - box[1])) :
-    ]
+    hidden = slice(int(box[1] + 0.4 * (box[3] - box[1])), None)
+    image[:, hidden] = photograph()[:, hidden]
     around = registrar_of(azimuth_step=90, elevations=[0, 45])
     result = around([image], box[None], K)[0]
     assert degrees_off(result, T) < 5.0
@@ -194,7 +198,7 @@ def test_keypoints_decide_where_most_of_the_object_is_hidden():
 
 
 def test_a_fit_that_leaves_the_keypoints_is_not_kept(monkeypatch):
-    T = pose(65.0, 0.4, 4.0)
+    T = pose(65.0)
 
     def fit_elsewhere(describer, crops, poses, **options):
         fitted = fit_poses(describer, crops, poses, **options)
@@ -207,7 +211,7 @@ def test_a_fit_that_leaves_the_keypoints_is_not_kept(monkeypatch):
 
     monkeypatch.setattr(block, "fit_poses", fit_elsewhere)
     monkeypatch.setattr(stages, "fit_texture_of", lambda *_: None)
-    result = registrar()([photograph(T)], box_of(T)[None], K)[0]
+    result = answer(registrar(), T)
     assert degrees_off(result, T) < 3.0
     assert result.edge_support > 0.0
     assert result.covariance is not None
@@ -229,7 +233,7 @@ def test_a_pose_needs_enough_keypoints_at_different_places():
 def test_origin_of_the_mesh_may_be_far_away(monkeypatch):
     """Behind the camera, and a thousand object radii off."""
     monkeypatch.setattr(keypoints_module, "VIEWS", 24)
-    T = pose(20.0, 0.4, 4.0)
+    T = pose(20.0)
     away = double([0.0, 0.0, 1000.0])
     moved = as_mesh(carton().apply_translation(away.numpy()))
     matches = Keypoints(ViewDescriber(moved, BankSettings())).matches(photograph(T), K)
@@ -246,26 +250,24 @@ def registrar():
 
 def test_registration_starts_from_keypoints_too(monkeypatch):
     """No view of the bank is near the pose."""
-    T = pose(65.0, 0.4, 4.0)
-    image = photograph(T)
-    box = box_of(T)
-    assert rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3]) < 1.0
+    T = pose(65.0)
+    assert degrees_off(answer(registrar(), T), T) < 1.0
     nothing = torch.zeros(0, 4, 4, dtype=torch.float64), torch.zeros(0)
     monkeypatch.setattr(KeypointMatches, "poses", lambda *_: nothing)
-    assert rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3]) > 10.0
+    assert degrees_off(answer(registrar(), T), T) > 10.0
 
 
 def test_a_pose_outside_the_limits_is_no_start():
-    T = pose(65.0, 0.4, 4.0)
-    other = pose(155.0, 0.4, 4.0)
+    T = pose(65.0)
+    other = pose(155.0)
     limits = cr.PosePrior(rotation=other[:3, :3], within=40.0)
     around = registrar_of(azimuth_step=60, elevations=[25])
-    result = around([photograph(T)], box_of(T)[None], K, prior=limits)[0]
+    result = answer(around, T, prior=limits)
     assert min(float(degrees_off(h, T)) for h in result.hypotheses) > 40.0
 
 
 def test_meshes_without_colours_and_photographs_without_a_camera_have_no_keypoints():
-    T = pose(65.0, 0.4, 4.0)
+    T = pose(65.0)
     item = as_photographs([photograph(T)], box_of(T)[None], K)[0]
     grey = cr.Registrar(
         trimesh.creation.box(), views=cr.sample_views(azimuth_step=180, elevations=[0])
@@ -278,7 +280,7 @@ def test_meshes_without_colours_and_photographs_without_a_camera_have_no_keypoin
 
 @pytest.mark.slow
 def test_boxes_of_keypoints_are_the_first_proposals_less_certain_with_a_rival():
-    T = pose(65.0, 0.4, 4.0)
+    T = pose(65.0)
     item = as_photographs([photograph(T)], None, K)[0]
     proposals = propose(registrar(), item)
     assert float(box_iou(proposals.boxes[:1], box_of(T)[None])) > 0.9

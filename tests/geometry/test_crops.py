@@ -5,10 +5,9 @@ import torch
 from torch.testing import assert_close
 
 from curvireg_torch import geometry as g
-from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry.crops import check_boxes, crop_squares, image_transforms
 from curvireg_torch.utils.checks import check_camera_matrix
-from tests._support import double, eye
+from tests._support import double, eye, refused
 
 
 def ramp(height, width):
@@ -65,13 +64,13 @@ def test_check_boxes_refuses_boxes_without_pixels():
         ([-9.0, 0.0, -0.5, 5.0], "entirely outside the 30 x 20 image"),
         ([29.5, 0.0, 40.0, 5.0], "entirely outside"),
     ):
-        with pytest.raises(InvalidInputError, match=rf"box 1 .*{match}"):
+        with refused(rf"box 1 .*{match}"):
             check_boxes(torch.tensor([[0.0, 0.0, 5.0, 5.0], box]), [(20, 30), (20, 30)])
 
 
 def test_crop_images_refuses_a_list_of_grey_and_colour():
     images = [torch.rand(3, 20, 30), torch.rand(1, 20, 30)]
-    with pytest.raises(InvalidInputError, match=r"images: expected shape \(3, \*, \*\), got \(1,"):
+    with refused(r"images: expected shape \(3, \*, \*\), got \(1,"):
         g.crop_images(images, [[0, 0, 5, 5], [0, 0, 5, 5]])
 
 

@@ -88,23 +88,13 @@ def test_backgrounds_are_ones_own_photographs(tmp_path, inspect, monkeypatch):
     assert blue < 20
 
 
-@pytest.mark.parametrize("kind", ["sphere", "wire", "room"])
-def test_a_mesh_that_cannot_work_ends_with_code_3_if_strict(tmp_path, capsys, inspect, kind):
-    if kind == "sphere":
-        mesh = trimesh.creation.icosphere(2, 0.1)
-        said = "rotation cannot be seen"
-    elif kind == "wire":
-        rods = np.diag([0.3, 0.3, 0.3]) + 3e-4
-        mesh = trimesh.util.concatenate([trimesh.creation.box(size) for size in rods])
-        said = "as of a wire"
-    else:
-        box = trimesh.creation.box((5.0, 4.0, 2.6))
-        mesh = trimesh.Trimesh(box.vertices, box.faces[:, ::-1])
-        said = "as a room's do"
+def test_a_mesh_that_cannot_work_ends_with_code_3_if_strict(tmp_path, capsys, inspect):
+    box = trimesh.creation.box((5.0, 4.0, 2.6))
+    mesh = trimesh.Trimesh(box.vertices, box.faces[:, ::-1])
     mesh.export(tmp_path / "mesh.ply")
     code, out = inspect(tmp_path / "mesh.ply", "--unit", "m", "--strict")
     assert code == 3
-    assert said in capsys.readouterr().out
+    assert "as a room's do" in capsys.readouterr().out
     document = json.loads((out / "inspect.json").read_text())
     assert document["hopeless"]
     assert document["expected"] is None

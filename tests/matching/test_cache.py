@@ -22,9 +22,12 @@ PIPELINE = replace(PRESETS["classical"], bank=BankSettings(image_size=64))  # qu
 VIEWS = sample_views(azimuth_step=90, elevations=[20])
 
 
-def cached_box(folder, edge=1.0, **options):
-    mesh = trimesh.creation.box((edge, 1.0, 1.0))
-    return cached_bank(mesh, VIEWS, pipeline=PIPELINE, folder=folder, progress=False, **options)
+def cached(mesh, folder):
+    return cached_bank(mesh, VIEWS, pipeline=PIPELINE, folder=folder, progress=False)
+
+
+def cached_box(folder, edge=1.0):
+    return cached(trimesh.creation.box((edge, 1.0, 1.0)), folder)
 
 
 def key(mesh, views=VIEWS, **options):
@@ -62,16 +65,15 @@ def test_bank_key_depends_on_everything(monkeypatch):
 
 
 def test_bank_of_another_unit_is_not_rendered_again(tmp_path, monkeypatch):
-    options = {"pipeline": PIPELINE, "folder": tmp_path, "progress": False}
     mesh = trimesh.creation.box()
-    assert cached_bank(mesh, VIEWS, **options).mesh.unit is None
+    assert cached(mesh, tmp_path).mesh.unit is None
     monkeypatch.setattr(ViewBank, "build", None)  # would fail
     for unit in ("mm", "m"):
         mesh.units = unit
-        bank = cached_bank(mesh, VIEWS, **options)
+        bank = cached(mesh, tmp_path)
         assert bank.mesh.unit == unit
     mesh = trimesh.creation.box()
-    assert cached_bank(mesh, VIEWS, **options).mesh.unit is None
+    assert cached(mesh, tmp_path).mesh.unit is None
     assert len(list_cache(tmp_path)) == 1
 
 
@@ -80,10 +82,7 @@ def test_a_bank_from_the_cache_has_the_warnings_of_this_mesh(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=3)
     leftover = trimesh.Trimesh([[40.0, 0, 0], [40.01, 0, 0], [40.0, 0.01, 0]], [[0, 1, 2]])
     with_leftover = trimesh.util.concatenate([ball, leftover])
-    found = [
-        cached_bank(mesh, VIEWS, pipeline=PIPELINE, folder=tmp_path, progress=False).mesh
-        for mesh in (ball, with_leftover, ball)
-    ]
+    found = [cached(mesh, tmp_path).mesh for mesh in (ball, with_leftover, ball)]
     assert len(list_cache(tmp_path)) == 1
     kinds = [[warning.kind for warning in mesh.warnings] for mesh in found]
     assert kinds == [[], ["stray"], []]
@@ -91,11 +90,10 @@ def test_a_bank_from_the_cache_has_the_warnings_of_this_mesh(tmp_path):
 
 def test_cached_bank_is_loaded_the_second_time(tmp_path, monkeypatch):
     meshes = [trimesh.creation.box(), standing(), textured(uv=100.0), textured(uv=100.0, level=1)]
-    options = {"pipeline": PIPELINE, "folder": tmp_path, "progress": False}
-    banks = [cached_bank(mesh, VIEWS, **options) for mesh in meshes]
+    banks = [cached(mesh, tmp_path) for mesh in meshes]
     monkeypatch.setattr(ViewBank, "build", None)  # would fail
     for mesh, bank in zip(meshes, banks, strict=True):
-        again = cached_bank(mesh, VIEWS, **options)
+        again = cached(mesh, tmp_path)
         assert torch.equal(again.descriptors, bank.descriptors)
         found = ViewBank.load(next(iter(list_cache(tmp_path))).path).mesh
         given = as_mesh(mesh)

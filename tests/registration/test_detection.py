@@ -96,17 +96,6 @@ def test_detected_pose_is_the_true_one(seed, corner, scale):
     assert (result.translation - truth[:3, 3]).norm() < 0.05 * truth[:3, 3].norm()
 
 
-def test_detection_with_camera_and_distance(registrar):
-    image, _, truth = scene(5)
-    result = registrar([image], camera_matrices=CAMERA)[0]
-    assert (result.translation - truth[:3, 3]).norm() < 0.25 * truth[:3, 3].norm()
-    far = float(truth[2, 3])
-    within = registrar(
-        [image], camera_matrices=CAMERA, prior=cr.PosePrior(distance=(0.8 * far, 1.2 * far))
-    )[0]
-    assert 0.75 * far < float(within.translation[2]) < 1.3 * far
-
-
 def test_pose_outside_the_photograph_has_score_zero(registrar, found, monkeypatch):
     outside = double([-300.0, -200.0, -100.0, -50.0])
     monkeypatch.setattr(detection_module, "projected_box", lambda *_: outside)

@@ -17,7 +17,7 @@ from curvireg_torch.visualization.overlay import contour_overlay, registration_s
 from tests._support import answer_of, bank_of, double, exact_registrar
 from tests._support.canisters import canister
 from tests._support.results import FEATURES, registration
-from tests.registration.test_ties import hollow_box, photograph, registrar_of
+from tests.registration.test_ties import photograph
 
 UPRIGHT = RoundAxis(double([0.0, 0.0, 1.0]), torch.zeros(3).double(), False)
 
@@ -62,17 +62,6 @@ def test_the_axis_is_drawn_where_it_alone_is_certain():
     picture = contour_overlay(registrar, plain, image, box)
     assert not (picture == torch.tensor(AXIS).numpy()).all(-1).any()
     assert registration_sheet(registrar, result, image, box).shape[1] > 0
-
-
-def test_a_pair_has_a_probability_of_its_own():
-    registrar = registrar_of(hollow_box())
-    image, box, _ = photograph(hollow_box(), 35.0, 25.0, 0)
-    result = answer_of(registrar, image, box)
-    assert result.ambiguous == "half turn"
-    assert result.axis is None
-    assert result.confidence < 0.6
-    assert result.pair_probability > 0.9
-    assert result.to_dict()["pair_probability"] == result.pair_probability
 
 
 def test_axes_agree_by_their_direction_whatever_the_turn():

@@ -1,28 +1,25 @@
-"""The table of poses that compete in photographs."""
+"""The table of poses that compete in photographs: which views start them, which are distinct, which
+is the best."""
 
+import math
 from dataclasses import replace
 
+import pytest
 import torch
+from torch.testing import assert_close
 
-from curvireg_torch.evidence import Evidence, EvidenceWeights
-from curvireg_torch.registration.hypotheses import Hypotheses
-from tests._support import double, eye
+from curvireg_torch.evidence import EvidenceWeights
+from curvireg_torch.geometry import rotation_error
+from curvireg_torch.matching import Ranking
+from curvireg_torch.registration.hypotheses import Hypotheses, best_views, distinct_poses
+from tests._support import CAMERA, scene, truck_bank, truck_registrar
+from tests._support.hypotheses import evidence_of, placed_at, poses_at
 
 WEIGHTS = EvidenceWeights.only(similarity=10.0)
 
 
 def hypotheses(*similarity):
-    count = len(similarity)
-    T = eye(4).repeat(count, 1, 1)
-    T[:, 2, 3] = 5.0
-    views = torch.arange(count)
-    cameras = eye(3).expand(count, 3, 3)
-    poses = Hypotheses.at(T, cameras, torch.zeros(3).double(), views, -views.double())
-    return replace(poses, evidence=of_similarity(*similarity))
-
-
-def of_similarity(*similarity):
-    return replace(Evidence.zeros(len(similarity)), similarity=double(similarity))
+    return replace(poses_at(*[0.0] * len(similarity)), evidence=evidence_of(*similarity))
 
 
 def test_the_best_pose_is_neither_outside_the_limits_nor_merged_with_another():
@@ -45,9 +42,44 @@ def test_each_photograph_has_its_own_best_pose():
 def test_poses_take_their_places_with_their_evidence_and_what_is_known_of_the_places_stays():
     before = replace(hypotheses(0.5, 0.7, 0.9), is_outside=torch.tensor([False, True, False]))
     index = torch.tensor([1])
-    moved = replace(before[index], T=2.0 * before.T[index], evidence=of_similarity(0.8))
+    moved = replace(before[index], T=2.0 * before.T[index], evidence=evidence_of(0.8))
     after = before.with_poses(index, replace(moved, is_outside=torch.tensor([False])))
     assert after.evidence.similarity.tolist() == [0.5, 0.8, 0.9]
     changed = (after.T != before.T).flatten(1).any(dim=1)
     assert changed.tolist() == [False, True, False]
     assert after.is_outside.tolist() == [False, True, False]
+
+
+def test_distinct_poses():
+    for degrees, score, expected in (
+        ([0.0, 14.0, 16.0, 180.0], [0.9, 0.8, 0.7, 0.6], [True, False, True, True]),
+        ([0.0, 10.0], [0.1, 0.2], [False, True]),
+    ):
+        assert (
+            distinct_poses(poses_at(*degrees), torch.tensor(score), angle=15.0).tolist() == expected
+        )
+
+
+def test_best_views_are_distinct_and_ranked_relative_to_the_best():
+    scores = torch.full((1, len(truck_bank())), 0.01)
+    scores[0, [4, 5, 60]] = torch.tensor([0.8, 0.7, 0.2])  # 4 and 5 are neighbours
+    ranking = Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), {}, None)
+    view, rank = best_views(ranking, truck_bank(), count=2)
+    assert (view.tolist(), rank.tolist()) == (
+        [4, 60],
+        pytest.approx([0.0, math.log(0.25)], abs=1e-6),
+    )
+
+
+def test_poses_fill_their_box():
+    describer, (_, box, T) = truck_registrar().describer, scene(0)
+    exact = placed_at(T[None], describer.centre)
+    assert_close(exact.distance, (T[:3, :3] @ describer.centre + T[:3, 3]).norm()[None])
+    again = Hypotheses.in_boxes(
+        describer, box[None], CAMERA[None], exact.rotation, exact.distance, exact.view, exact.rank
+    )
+    assert rotation_error(again.T[0, :3, :3], T[:3, :3]) < 2.0
+    assert ((again.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.03
+    assert_close(
+        again.distance, (again.T[0, :3, :3] @ describer.centre + again.T[0, :3, 3]).norm()[None]
+    )

@@ -7,7 +7,7 @@ import trimesh
 from curvireg_torch import sample_views
 from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
 from curvireg_torch.registration import judging
-from tests._support import answer_of, bank_of, exact_registrar, learned_registrar, scene
+from tests._support import answer_of, bank_of, double, exact_registrar, learned_registrar, scene
 from tests._support.hypotheses import placed_at
 from tests._support.poses import poses as random_poses
 
@@ -32,7 +32,7 @@ def test_reflected_poses_show_the_mesh_reflected():
     mesh = chiral_mesh()
     T = random_poses(1, seed=4)
     rotation = T[0, :3, :3]
-    plane = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
+    plane = double([0.0, 0.6, 0.8])
     centres = mesh_centre(mesh), mesh_centre(mirrored(mesh))
     found = judging.reflected_poses(placed_at(T, centres[0]), plane, *centres).T
     vertices = torch.from_numpy(mesh.vertices.copy())

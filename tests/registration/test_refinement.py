@@ -6,18 +6,20 @@ import torch
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch.errors import InvalidInputError, LostObjectError
+from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, transform
 from curvireg_torch.registration import refinement
 from curvireg_torch.synthetic import procedural_background, synthesize_photograph
 from tests._support import (
     CAMERA,
     SIZE,
+    answer_of,
     bank_of,
     double,
     errors,
     exact_registrar,
     learned_registrar,
+    refused,
     scene,
     seeded,
     slow_after,
@@ -100,7 +102,7 @@ def test_refine_refuses_wrong_arguments_and_a_start_that_does_not_show_the_mesh(
         ([2 * torch.eye(4)], CAMERA, "poses"),
         ([torch.eye(3)], CAMERA, "poses"),
     ):
-        with pytest.raises(InvalidInputError, match=message):
+        with refused(message):
             registrar.refine([scene(0)[0]], camera, poses)
 
 
@@ -120,7 +122,7 @@ def test_a_half_turn_does_not_become_believed_by_being_refined(seed):
     right, wrong = registrar.refine([image] * 2, CAMERA, [moved(T, degrees=3.0), T @ HALF_TURN])
     assert errors(right, T)[0] < 2.0
     assert not wrong.ok or wrong.confidence < min(0.5, right.confidence)
-    registered = registrar([image], box[None], CAMERA)[0]
+    registered = answer_of(registrar, image, box)
     assert right.confidence <= registered.confidence + 0.05
 
 

@@ -11,7 +11,7 @@ from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration.result import Axis, ambiguity, likely_rivals
-from tests._support import double, eye
+from tests._support import double, eye, refused
 from tests._support.results import registration
 
 
@@ -56,10 +56,10 @@ def test_what_no_registration_has_a_photograph_without_a_pose_has_neither():
     assert not hasattr(lost, "foo")
     assert getattr(lost, "foo", 7) == 7
     assert not hasattr(lost, "_repr_html_"), "notebooks ask for it"
-    with pytest.raises(AttributeError, match="'FailedRegistration' object has no attribute 'foo'"):
+    with refused("'FailedRegistration' object has no attribute 'foo'", AttributeError):
         lost.foo  # noqa: B018
     for name in ("rotation", "confidence", "reliable", "to_dict"):
-        with pytest.raises(LostObjectError, match="not found"):
+        with refused("not found", LostObjectError):
             getattr(lost, name)
 
 
@@ -67,8 +67,20 @@ def test_the_confidence_is_shown_rounded_down():
     assert "confidence 0.89" in repr(registration(confidence=0.897))
 
 
-def turned(*degrees, elevation=0.0):
-    return torch.stack([rotation_from_viewpoint(d, elevation, 0.0).double() for d in degrees])
+def turned(*degrees):
+    return torch.stack([rotation_from_viewpoint(d, 0.0, 0.0).double() for d in degrees])
+
+
+def with_each(result, **changes):
+    """With the same changes of each hypothesis."""
+    return replace(result, hypotheses=tuple(replace(h, **changes) for h in result.hypotheses))
+
+
+def seen_at(*degrees):
+    """A registration whose hypotheses are turned so."""
+    found = registration()
+    pairs = zip(found.hypotheses, turned(*degrees), strict=True)
+    return replace(found, hypotheses=tuple(replace(h, allocentric_rotation=R) for h, R in pairs))
 
 
 def test_ambiguity():
@@ -81,11 +93,8 @@ def test_ambiguity():
         "several",
     ]
     # Rivals that are half as probable:
-    found = registration()
-    pairs = zip(found.hypotheses, turned(40.0, 320.0), strict=True)
-    hypotheses = tuple(replace(h, allocentric_rotation=R) for h, R in pairs)
     for second, word in ((0.31, "mirror"), (0.29, None)):
-        result = replace(found, hypotheses=hypotheses, probabilities=(0.6, second))
+        result = replace(seen_at(40.0, 320.0), probabilities=(0.6, second))
         assert (result.ambiguous, result.no_match_probability) == (
             word,
             pytest.approx(0.4 - second),
@@ -110,10 +119,7 @@ def test_rivals_are_half_as_probable_or_the_second_of_a_reliable_pair(probabilit
 
 
 def test_a_reliable_pair_of_which_none_is_reliable_is_ambiguous():
-    found = registration()
-    pairs = zip(found.hypotheses, turned(0.0, 180.0), strict=True)
-    hypotheses = tuple(replace(h, allocentric_rotation=R) for h, R in pairs)
-    result = replace(found, hypotheses=hypotheses, probabilities=(0.6, 0.29))
+    result = replace(seen_at(0.0, 180.0), probabilities=(0.6, 0.29))
     assert result.ambiguous is None
     result = replace(result, pair_probability=0.9)
     assert result.ambiguous == "half turn"
@@ -129,38 +135,29 @@ def test_of_several_meshes_none_is_right_where_all_of_them_are_improbable():
 def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_determine():
     sure = replace(registration(covariance=0.01 * eye(6)), probabilities=(0.9, 0.0))
     assert sure.reliable
-    changes = [
-        {"warnings": ("the camera is questionable",)},
-        {"prior_contradiction": "better outside"},
-    ]
     for change in (
         {"probabilities": (0.89, 0.0)},
         {"probabilities": (torch.nan, 0.0)},
         {"probabilities": ()},
-        *changes,
+        {"warnings": ("the camera is questionable",)},
+        {"prior_contradiction": "better outside"},
     ):
         assert not replace(sure, **change).reliable
     assert replace(sure, prior_contradiction="at the limit").reliable
     # Not where all three rotations are unknown, as those of a sphere.
     variances = double([9.0, 9.0, 9.0, 1e-4, 1e-4, 1e-4])
     sphere = registration(covariance=torch.diag(variances), confidence=0.95)
-    fitted = replace(
-        sphere, hypotheses=tuple(replace(h, edge_support=0.5) for h in sphere.hypotheses)
-    )
+    fitted = with_each(sphere, edge_support=0.5)
     assert not fitted.reliable
     for keypoints, determine in ((7, False), (8, True)):
         evidence = {"keypoints": math.log1p(keypoints - 2)}
-        agreed = tuple(replace(h, evidence=evidence) for h in fitted.hypotheses)
-        assert replace(fitted, hypotheses=agreed).reliable == determine
+        assert with_each(fitted, evidence=evidence).reliable == determine
     variances[0] = 1e-4
-    known = tuple(replace(h, covariance=torch.diag(variances)) for h in fitted.hypotheses)
-    assert replace(fitted, hypotheses=known).reliable
+    assert with_each(fitted, covariance=torch.diag(variances)).reliable
 
 
 def test_a_rotation_that_is_not_determined_is_not_reliable():
-    sure = registration(covariance=1e-4 * eye(6), confidence=0.95)
-    fitted = tuple(replace(hypothesis, edge_support=0.6) for hypothesis in sure.hypotheses)
-    sure = replace(sure, hypotheses=fitted)
+    sure = with_each(registration(covariance=1e-4 * eye(6), confidence=0.95), edge_support=0.6)
     for undetermined, is_reliable in ((0.99, True), (1.0, False)):
         result = replace(sure, confidence_features={"undetermined": undetermined})
         assert result.reliable == is_reliable

@@ -14,13 +14,13 @@ from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import rig as rig_module
 from curvireg_torch.registration.rig import ELSEWHERE, Rig, RigPhotograph, RigProblem
-from tests._support import double
+from tests._support import double, eye
 from tests._support.hypotheses import evidence_of
 
 LOST_CONFIDENCE = Pipeline().fit.lost_confidence
 CENTRE = double([0.2, -0.1, 0.3])
 RADIUS = 2.0
-ORIGIN = torch.eye(4, dtype=torch.float64)
+ORIGIN = eye(4)
 
 
 def turned(*degrees, shift=0.0):
@@ -37,7 +37,7 @@ def rig_of(eyes, **attributes):
     rig.eyes = eyes + CENTRE
     rig.describer = SimpleNamespace(centre=CENTRE, radius=RADIUS, hull=None)
     rig.target = SimpleNamespace(pipeline=Pipeline())
-    rig.symmetries = torch.eye(3).double()[None]
+    rig.symmetries = eye(3)[None]
     for name, value in attributes.items():
         setattr(rig, name, value)
     return rig
@@ -90,7 +90,7 @@ def test_candidates_that_are_nearly_equal_count_once():
     assert rig.distinct(T, score).tolist() == [0, 2, 4, 5]
     assert rig.distinct(T, -score).tolist() == [5, 4, 2, 0]
     half_turn = torch.diag(double([-1.0, -1.0, 1.0]))
-    rig.symmetries = torch.stack([torch.eye(3).double(), half_turn])
+    rig.symmetries = torch.stack([eye(3), half_turn])
     assert rig.distinct(T, score).tolist() == [0, 2, 4]
 
 
@@ -179,17 +179,16 @@ def test_a_pose_is_seen_where_its_box_overlaps_that_of_the_photograph(monkeypatc
 def problem(**changes):
     """Two world poses in two photographs each."""
     nothing = None
-    eye = torch.eye(3).double()
     given = {
         "contours": SimpleNamespace(centre=CENTRE),
         "edges": nothing,
         "image_index": torch.tensor([0, 1, 0, 1]),
-        "K": eye.repeat(4, 1, 1),
+        "K": eye(3).repeat(4, 1, 1),
         "size": 256,
-        "axes": eye.repeat(4, 1, 1),
+        "axes": eye(3).repeat(4, 1, 1),
         "group": torch.tensor([0, 0, 1, 1]),
         "alone": ORIGIN.repeat(4, 1, 1),
-        "root": torch.eye(6).double().repeat(4, 1, 1),
+        "root": eye(6).repeat(4, 1, 1),
     }
     return RigProblem(**(given | changes))
 
@@ -208,7 +207,7 @@ def test_sums_are_over_the_photographs_of_each_pose():
 def test_gaps_are_towards_the_poses_that_photographs_alone_found():
     """10 degrees about z, and half a unit to the right: in standard deviations of half of each."""
     alone = torch.cat([turned(10.0), turned(0.0, shift=0.5), turned(0.0), turned(0.0)])
-    found = problem(alone=alone, root=2.0 * torch.eye(6).double().repeat(4, 1, 1)).gaps(
+    found = problem(alone=alone, root=2.0 * eye(6).repeat(4, 1, 1)).gaps(
         turned(0.0).repeat(4, 1, 1)
     )[..., 0]
     expected = torch.zeros(4, 6, dtype=torch.float64)
@@ -220,7 +219,7 @@ def test_gaps_are_towards_the_poses_that_photographs_alone_found():
 def test_a_solution_is_common_to_the_photographs_along_their_own_axes():
     """Each photograph knows one direction of the world well: together they know both."""
     quarter = rotation_from_axis_angle(double([0.0, 0.0, math.pi / 2]))
-    axes = torch.stack([torch.eye(3).double(), quarter] * 2)
+    axes = torch.stack([eye(3), quarter] * 2)
     wanted = double([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
     P = rig_module.in_frames(axes)
     A = torch.stack([torch.diag(torch.tensor([5.0, 1.0, 1.0, 5.0, 1.0, 1.0]))] * 4).double()

@@ -126,10 +126,14 @@ def searched(*truth, camera="perspective", frame="own", allowed=0.0, kind=Peak, 
     return float(rotation_error(rotation, R)), float(found) / (0.5 * 14**0.5), matcher
 
 
+def azimuths(views):
+    return sorted(set(views.azimuth.round().tolist()))
+
+
 def test_search_looks_between_the_least_and_greatest_angles_and_distances():
     error, distance, matcher = searched(207.0, 0.0, 3.7)
     first = matcher.compared[0]
-    assert sorted(set(first.azimuth.round().tolist())) == [200, 205, 210, 215, 220]
+    assert azimuths(first) == [200, 205, 210, 215, 220]
     assert sorted(set(first.distance.tolist())) == [3.0, 3.25, 3.5, 3.75, 4.0, 4.25, 4.5]
     assert error < 2.0
     assert distance == pytest.approx(3.7, abs=0.1)
@@ -139,10 +143,10 @@ def test_further_rounds_are_between_views_that_are_neighbours_on_the_finer_grid(
     """Of the three best views of the first round one is two of its steps away."""
     _, _, matcher = searched(205.0, 0.0, 3.75, kind=TwoPeaks)
     first, second = matcher.compared[:2]
-    assert sorted(set(first.azimuth.round().tolist())) == [200, 205, 210, 215, 220]
+    assert azimuths(first) == [200, 205, 210, 215, 220]
     best = matcher.scores(first).argsort(descending=True)[:3]
     assert sorted(first.azimuth[best].round().tolist()) == [205, 205, 215]
-    assert set(second.azimuth.round().tolist()) == {205}
+    assert azimuths(second) == [205]
 
 
 def test_views_down_the_ranking_give_the_search_something_to_search():
@@ -152,7 +156,7 @@ def test_views_down_the_ranking_give_the_search_something_to_search():
     assert len(search.coherent_of(matcher.bank, matcher.ranking)) == 1
     assert [len(views) for views in matcher.compared] == [1]
     error, _, matcher = searched(7.0, 0.0, 3.0, **options, least_coherent=2)
-    assert sorted(set(matcher.compared[0].azimuth.round().tolist())) == [0, 5, 10, 15, 20]
+    assert azimuths(matcher.compared[0]) == [0, 5, 10, 15, 20]
     assert error < 2.5
 
 

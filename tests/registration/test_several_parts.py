@@ -14,7 +14,7 @@ from curvireg_torch.registration import several
 from curvireg_torch.registration.confidence import hypothesis_probabilities
 from curvireg_torch.registration.photograph import as_photograph, copies_of
 from curvireg_torch.registration.rig import JointPoses
-from tests._support import double, eye
+from tests._support import double, eye, refused
 
 ANY_RIGHT = 0.8
 EYE = eye(4)
@@ -205,7 +205,7 @@ def test_copies_are_of_one_camera_in_one_place(away):
     assert copies_of(T, [one, as_photograph(image[:, :30, :45], None, wide)]) == {}
     assert copies_of(T, [one, one.by(wide.at((44, 66)).matrix)]) == {}
     other = as_photograph(1.0 - image, None, wide)
-    with pytest.raises(InvalidInputError, match=r"image 1 and image 0: .* show different"):
+    with refused(r"image 1 and image 0: .* show different"):
         copies_of(T, [one, other])
     for shift, expected in ((0.5e-4, {1: 0}), (2e-4, {})):
         moved = T.clone()

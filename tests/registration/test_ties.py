@@ -17,6 +17,7 @@ from curvireg_torch.synthetic import synthesize_photograph
 from tests._support import (
     CAMERA,
     SIZE,
+    answer_of,
     bank_of,
     exact_registrar,
     eye,
@@ -66,7 +67,7 @@ def photograph(mesh, azimuth, elevation, seed):
 def registered(registrar, azimuth, elevation, seed):
     """The result and its error in degrees."""
     image, box, T = photograph(registrar.bank.mesh, azimuth, elevation, seed)
-    result = registrar([image], box[None], CAMERA)[0]
+    result = answer_of(registrar, image, box)
     return result, float(rotation_error(result.rotation, T[:3, :3]))
 
 
@@ -82,6 +83,9 @@ def test_half_turn_that_nothing_in_view_decides_is_named_and_not_reliable(azimut
     assert result.probabilities[0] == pytest.approx(result.probabilities[1], rel=0.3)
     assert result.confidence <= 0.5
     assert not result.reliable
+    assert result.axis is None
+    assert result.pair_probability > 0.9
+    assert result.to_dict()["pair_probability"] == result.pair_probability
     turn = float(rotation_error(result.hypotheses[0].rotation, result.hypotheses[1].rotation))
     assert turn == pytest.approx(180.0, abs=5.0)
 

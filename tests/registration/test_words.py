@@ -2,8 +2,6 @@
 
 from collections import Counter
 
-import torch
-
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import object_frame
 from curvireg_torch.registration.confidence import two_decimals
@@ -14,6 +12,7 @@ from curvireg_torch.visualization.words import (
     remarks,
     verdict_counts,
 )
+from tests._support import double
 
 
 def test_remarks_name_a_contradicted_prior_and_the_replaced_box_in_whole_pixels():
@@ -48,7 +47,7 @@ def test_pose_in_words():
         ((45, 80, 0), "seen from above (azimuth 45°), 80° above the horizon"),
         ((45, -80, 0), "seen from below (azimuth 45°), 80° below the horizon"),
     ):
-        R = rotation_from_viewpoint(*torch.tensor(viewpoint, dtype=torch.float64))
+        R = rotation_from_viewpoint(*double(viewpoint))
         assert pose_in_words(R) == words
         for up, front in (("y", None), ("-x", None), ("z", "x")):
             assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words

@@ -9,7 +9,15 @@ from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration.photograph import OnDemand
 from curvireg_torch.registration.registrar import _register_by_workers
 from curvireg_torch.utils.executors import Workers
-from tests._support import CAMERA, scene, truck_bank, truck_registrar
+from tests._support import (
+    CAMERA,
+    answer_of,
+    exact_registrar,
+    refused,
+    scene,
+    truck_bank,
+    truck_registrar,
+)
 
 
 class EndsItsProcess:
@@ -43,7 +51,7 @@ def test_processes_give_the_results_of_one_in_the_same_order(tmp_path):
 def test_a_process_that_ends_is_an_error():
     registrar = Registrar(truck_bank(), workers=2)
     items = [EndsItsProcess(), EndsItsProcess()]
-    with pytest.raises(WorkerError, match="a process ended"):
+    with refused("a process ended", WorkerError):
         registrar.register_prepared(items)
     images = [scene(0)[0]] * 2
     results = registrar(images, scene(0)[1].expand(2, 4), CAMERA)  # by new processes
@@ -73,11 +81,12 @@ def test_photographs_for_workers_are_read_when_they_are_asked_for():
 
 def test_one_photograph_needs_no_process(monkeypatch):
     monkeypatch.setattr(Workers, "map", None)  # would fail
-    registrar = Registrar(truck_bank(), workers=2)
-    assert registrar([scene(0)[0]], scene(0)[1][None], CAMERA)[0].ok
+    image, box, _ = scene(0)
+    registrar = exact_registrar(truck_bank(), workers=2)
+    assert answer_of(registrar, image, box).ok
 
 
 @pytest.mark.parametrize("count", [0, 1.5])
 def test_workers_are_counted(count):
-    with pytest.raises(InvalidInputError, match="workers"):
+    with refused("workers"):
         Registrar(truck_bank(), workers=count)

@@ -10,14 +10,16 @@ import trimesh
 
 from curvireg_torch.geometry import transform
 from curvireg_torch.rendering.contours import MAX_OCCLUDING, MeshContours, _Places, _Views
-from tests._support import double
+from tests._support import double, eye
 
 SIZE = 128
+RADIUS = np.hypot(0.5, 0.5)
+"""Of the plate."""
 DISTANCE = 10.0
 PIXEL = 0.01
 """Length of a pixel at the plate's distance."""
 K = double([[DISTANCE / PIXEL, 0, 63.5], [0, DISTANCE / PIXEL, 63.5], [0, 0, 1]])
-IN_FRONT = transform(torch.eye(3).double(), double([0.0, 0.0, DISTANCE]))[None]
+IN_FRONT = transform(eye(3), double([0.0, 0.0, DISTANCE]))[None]
 
 
 def strip(x, z, y=0.5):
@@ -73,7 +75,7 @@ def plates(gap):
     """A plate, and a smaller one of 40 px in front of it; the gap is a fraction of the radius."""
     large = strip([-0.5, 0.5], [0.0, 0.0])
     small = strip([-0.2, 0.2], [0.0, 0.0], y=0.2)
-    small.apply_translation((0.0, 0.0, -gap * np.hypot(0.5, 0.5)))
+    small.apply_translation((0.0, 0.0, -gap * RADIUS))
     return trimesh.util.concatenate([large, small])
 
 
@@ -91,18 +93,16 @@ def test_an_inner_contour_needs_a_step_in_depth(gap, expected, unit):
 @pytest.mark.parametrize(("gap", "expected"), [(0.01, True), (0.03, False)])
 def test_a_crease_may_lie_a_little_behind_the_surface(gap, expected, unit):
     """A fiftieth of the radius: a cover lies in front of the ridge."""
-    radius = np.hypot(0.5, 0.5)
     cover = strip([-0.3, 0.3], [0.0, 0.0], y=0.6)
-    cover.apply_translation((0.0, 0.0, -0.3 * 0.2 - gap * radius))
+    cover.apply_translation((0.0, 0.0, -0.3 * 0.2 - gap * RADIUS))
     assert has_crease(trimesh.util.concatenate([ridge(20.0, 0.3), cover]), unit) == expected
 
 
 @pytest.mark.parametrize(("drop", "expected"), [(0.05, True), (0.15, False)])
 def test_a_step_in_depth_is_no_crease(drop, expected):
     """Beyond a tenth of the radius: two slopes that fall steeply to both sides."""
-    radius = np.hypot(0.5, 0.5)
     a = 2.0 * PIXEL
-    depth = drop * radius
+    depth = drop * RADIUS
     steep = strip([-0.5, -a, 0.0, a, 0.5], [depth, depth, 0.0, depth, depth])
     assert has_crease(steep) == expected
 
