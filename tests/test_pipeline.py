@@ -112,6 +112,31 @@ def test_json_contains_every_setting():
         base.box_jitter = 0.0
 
 
+WRONG = """\
+{ => not JSON
+{"version": 99} => version 3
+{"field": "nope"} => field: expected one of 'learned'
+{"colour": 1} => colour
+{"views": {"theta_step": 0}} => theta_step
+{"bank": {"image_size": 4}} => image_size
+{"bank": {"block": 9}} => hog: expected 1 <= block
+{"fit": {"screened_views": 0}} => fit: screened_views
+{"fit": {"reliable": 2}} => fit: reliable
+{"fit": {"wide_angles": [-1]}} => fit: wide_angles
+{"fit": {"weights": {"detail": 1}}} => fit: weights: unknown key 'detail'
+{"terms": {"hug": {}}} => term: expected one of 'hog'
+{"box_jitter": 0.6} => box_jitter
+{"box_is": "half"} => box_is: expected one of 'whole', 'visible'
+{"terms": {"appearance": {}}} => each term once, and 'hog'
+{"box_jitter": "0.1"} => box_jitter
+{"hypotheses": 2.5} => hypotheses
+{"hypotheses": null} => hypotheses
+{"search": "yes"} => search
+{"bank": {"image_size": [64]}} => image_size
+{"terms": {"repeatability": {}}} => each term once, and 'hog'
+{"terms": {"hog": {}, "appearance": {"weights": "0"}}} => expected weights 0"""
+
+
 def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_mistake(tmp_path):
     path = tmp_path / "mine.json"
     text = json.dumps({"box_jitter": 0.0, "terms": {"hog": {"weight": 2.0}}})
@@ -119,31 +144,9 @@ def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_
     assert Pipeline.read(path) == Pipeline(box_jitter=0.0, terms=(Correlation(weight=2.0),))
     with refused("no such pipeline", MissingFileError):
         Pipeline.read(tmp_path / "none.json")
-    for text, message in (
-        ("{", "not JSON"),
-        ('{"version": 99}', "version 3"),
-        ('{"field": "nope"}', "field: expected one of 'learned'"),
-        ('{"colour": 1}', "colour"),
-        ('{"views": {"theta_step": 0}}', "theta_step"),
-        ('{"bank": {"image_size": 4}}', "image_size"),
-        ('{"bank": {"block": 9}}', "hog: expected 1 <= block"),
-        ('{"fit": {"screened_views": 0}}', "fit: screened_views"),
-        ('{"fit": {"reliable": 2}}', "fit: reliable"),
-        ('{"fit": {"wide_angles": [-1]}}', "fit: wide_angles"),
-        ('{"fit": {"weights": {"detail": 1}}}', "fit: weights: unknown key 'detail'"),
-        ('{"terms": {"hug": {}}}', "term: expected one of 'hog'"),
-        *((f'{{"terms": {{"{name}": {{"weight": -1}}}}}}', f"{name}: weight") for name in TERMS),
-        ('{"box_jitter": 0.6}', "box_jitter"),
-        ('{"box_is": "half"}', "box_is: expected one of 'whole', 'visible'"),
-        ('{"terms": {"appearance": {}}}', "each term once, and 'hog'"),
-        ('{"box_jitter": "0.1"}', "box_jitter"),
-        ('{"hypotheses": 2.5}', "hypotheses"),
-        ('{"hypotheses": null}', "hypotheses"),
-        ('{"search": "yes"}', "search"),
-        ('{"bank": {"image_size": [64]}}', "image_size"),
-        ('{"terms": {"repeatability": {}}}', "each term once, and 'hog'"),
-        ('{"terms": {"hog": {}, "appearance": {"weights": "0"}}}', "expected weights 0"),
-    ):
+    rows = [row.split(" => ") for row in WRONG.splitlines()]
+    rows += [[f'{{"terms": {{"{name}": {{"weight": -1}}}}}}', f"{name}: weight"] for name in TERMS]
+    for text, message in rows:
         path = tmp_path / "mine.json"
         path.write_text(text)
         with refused(message) as caught:

@@ -26,6 +26,7 @@ from tests._support import double, eye, refused
 
 from ._support.cans import can
 from ._support.real_data import real_case, real_data
+from ._support.tables import text_table
 
 FOCAL = (520.5, 522.0)
 CENTRE = (321.25, 238.5)
@@ -51,10 +52,15 @@ CAMERAS = {
 }
 
 
+def file_of(name):
+    """A file of a case, as FOLDER/FILE."""
+    folder, _, file = name.partition("/")
+    return real_case(folder) / file
+
+
 @pytest.mark.parametrize(("name", "expected"), CAMERAS.items(), ids=CAMERAS)
 def test_calibrations_are_read_with_their_distortion(name, expected):
-    folder, _, file = name.partition("/")
-    camera = cr.load_camera(f"{real_case(folder)}/{file}")
+    camera = cr.load_camera(file_of(name))
     assert_close(camera.matrix, cr.camera_matrix(*FOCAL, *CENTRE).double())
     assert (camera.distortion, camera.size, camera.model) == (*expected, "radial-tangential")
 
@@ -144,29 +150,23 @@ def colours_of(mesh):
 
 RED = (255, 0, 0)
 BLUE = (0, 0, 255)
-BOXES = {
-    "m01-obj-bom/plain.obj": set(),
-    "m01-obj-bom/bom-v.obj": set(),
-    "m01-obj-bom/bom-mtllib.obj": {(204, 26, 26)},
-    "m01-obj-bom/bom-comment.obj": set(),
-    "m03-obj-empty-usemtl/a.obj": set(),
-    "m05-stl-solid-header/sw.stl": set(),
-    "m06-stl-length/tail.stl": set(),
-    "m07-stl-ascii-variants/latin1.stl": set(),
-    "m07-stl-ascii-variants/named.stl": set(),
-    "m07-stl-ascii-variants/tabs.stl": set(),
-    "m07-stl-ascii-variants/upper.stl": set(),
-    "m12-two-mtllib/lines.obj": {RED, BLUE},
-    "m12-two-mtllib/words.obj": {RED, BLUE},
-    "m13-glb-vertex-colours-and-material/with.gltf": {RED, BLUE},
-    "m13-glb-vertex-colours-and-material/without.gltf": {RED, BLUE},
-}
+PLAIN = """
+    m01-obj-bom/plain.obj m01-obj-bom/bom-v.obj m01-obj-bom/bom-comment.obj
+    m03-obj-empty-usemtl/a.obj m05-stl-solid-header/sw.stl m06-stl-length/tail.stl
+    m07-stl-ascii-variants/latin1.stl m07-stl-ascii-variants/named.stl
+    m07-stl-ascii-variants/tabs.stl m07-stl-ascii-variants/upper.stl
+"""
+PAINTED = """
+    m12-two-mtllib/lines.obj m12-two-mtllib/words.obj
+    m13-glb-vertex-colours-and-material/with.gltf m13-glb-vertex-colours-and-material/without.gltf
+"""
+BOXES = {name: set() for name in PLAIN.split()} | {name: {RED, BLUE} for name in PAINTED.split()}
+BOXES["m01-obj-bom/bom-mtllib.obj"] = {(204, 26, 26)}
 
 
 @pytest.mark.parametrize(("name", "colours"), BOXES.items(), ids=BOXES)
 def test_meshes_have_all_their_faces_and_colours(name, colours):
-    folder, _, file = name.partition("/")
-    mesh, texts = loaded(real_case(folder) / file)
+    mesh, texts = loaded(file_of(name))
     assert (sorted(mesh.extents.tolist()), len(mesh.faces)) == ([1.0, 2.0, 3.0], 12)
     assert abs(mesh.surface.volume) == pytest.approx(6.0)
     assert colours_of(mesh) == colours
@@ -191,18 +191,22 @@ def test_three_boxes_in_one_obj():
     assert len(mesh.surface.split(only_watertight=True)) == 3
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("m06-stl-length/cut.stl", "it says 12 faces and holds 9: it was cut"),
-        ("m06-stl-length/zero.stl", "it says 0 faces and holds 12"),
-        ("m07-stl-ascii-variants/comma.stl", "decimal commas; export it with decimal points"),
-    ],
-)
-def test_meshes_that_are_cut_or_in_another_notation_are_refused(name, words):
-    folder, _, file = name.partition("/")
+REFUSED = """
+m06-stl-length/cut.stl           | it says 12 faces and holds 9: it was cut
+m06-stl-length/zero.stl          | it says 0 faces and holds 12
+m07-stl-ascii-variants/comma.stl | decimal commas; export it with decimal points
+n45-no-faces/lines.obj           | no faces: a cloud of points, splats or lines
+n45-no-faces/points.obj          | 400 points and no faces: a cloud of points
+n45-no-faces/points.ply          | reconstruct its surface
+n45-no-faces/splats.ply          | reconstruct its surface
+n45-no-faces/strips.ply          | strips of triangles, which are not read; export triangles
+"""
+
+
+@pytest.mark.parametrize(("name", "words"), text_table(REFUSED))
+def test_meshes_that_are_cut_in_another_notation_or_without_faces_are_refused(name, words):
     with refused(words, MeshError):
-        cr.load_mesh(real_case(folder) / file)
+        cr.load_mesh(file_of(name))
 
 
 def write_can(folder, library):
@@ -335,21 +339,6 @@ def test_colours_of_which_one_is_above_one(suffix):
     assert_allclose(mesh.extents, expected.extents, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("lines.obj", "no faces: a cloud of points, splats or lines"),
-        ("points.obj", "400 points and no faces: a cloud of points"),
-        ("points.ply", "reconstruct its surface"),
-        ("splats.ply", "reconstruct its surface"),
-        ("strips.ply", "strips of triangles, which are not read; export triangles"),
-    ],
-)
-def test_what_has_no_faces_is_named(name, words):
-    with refused(words, MeshError):
-        cr.load_mesh(real_case("n45-no-faces") / name)
-
-
 def test_meshes_of_a_ros_package_are_found():
     package = real_case("n48-urdf-of-a-package") / "lamp_description"
     mesh, texts = loaded(package / "urdf" / "lamp.urdf")
@@ -363,9 +352,8 @@ def test_meshes_of_a_ros_package_are_found():
     [("lamp/lamp.stl", None, "mm"), ("n72-unit-forgotten/lamp.glb", "mm", "m")],
 )
 def test_the_forgotten_unit_is_proposed(name, given, likely):
-    folder, _, file = name.partition("/")
     with pytest.warns(CurviregWarning, match=rf"if that is wrong, give the unit \({likely}\?\)"):
-        cr.load_mesh(real_case(folder) / file, unit=given)
+        cr.load_mesh(file_of(name), unit=given)
 
 
 def test_a_calibration_of_the_turned_phone_is_refused():

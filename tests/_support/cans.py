@@ -18,10 +18,7 @@ def can(word="BEANS"):
     angle = np.linspace(0, 2 * np.pi, 49)
     ring = np.stack([np.sin(angle), np.cos(angle)], axis=1)
     side = [np.c_[ring[:, 0], np.full(49, y), ring[:, 1]] for y in (-1.3, 1.3)]
-    lids = [
-        *(np.c_[ring[:, 0], np.full(49, y), ring[:, 1]] for y in (-1.3, 1.3)),
-        [[0, -1.3, 0], [0, 1.3, 0]],
-    ]
+    lids = [*side, [[0, -1.3, 0], [0, 1.3, 0]]]
     places = [np.c_[angle / (2 * np.pi), np.full(49, v)] for v in (0.0, 1.0)]
     k = np.arange(48)
     faces = [np.c_[k, k + 1, k + 50], np.c_[k, k + 50, k + 49]]

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
+from tests._support.miniature import write_json
 from tests._support.scenes import learned_registrar, scene, truck_bank, write_photo
 from tests.registration.test_several import EASY, rig_of
 
@@ -123,4 +124,4 @@ def write_bop_scene(folder, rows, objects, boxes):
     truth = {k: [{"obj_id": number} for number in some] for k, some in enumerate(objects)}
     info = {k: [{"bbox_obj": box} for box in boxes] for k in range(len(rows))}
     for name, content in (("camera", cameras), ("gt", truth), ("gt_info", info)):
-        (folder / f"scene_{name}.json").write_text(json.dumps(content))
+        write_json(folder / f"scene_{name}.json", content)

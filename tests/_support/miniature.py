@@ -163,12 +163,12 @@ def write_bop(root):
     }
     cameras = dict.fromkeys(("0", "3", "4"), K)  # 5: without camera
     for name, content in (("gt", ground_truth), ("camera", cameras), ("gt_info", infos)):
-        _write_json(one / f"scene_{name}.json", content)
+        write_json(one / f"scene_{name}.json", content)
     for key in ("0", "3", "5"):  # 4: without image
         write_image(one / "rgb" / f"{int(key):06d}.jpg", seed=int(key))
     two = root / "test" / "000002"  # grey, without scene_gt_info
-    _write_json(two / "scene_gt.json", {"7": [pose]})
-    _write_json(two / "scene_camera.json", {"7": K})
+    write_json(two / "scene_gt.json", {"7": [pose]})
+    write_json(two / "scene_camera.json", {"7": K})
     two.joinpath("gray").mkdir()
     cv2.imwrite(str(two / "gray" / "000007.png"), np.full((60, 80), 51, dtype=np.uint8))
     damaged = root / "test" / "000003"
@@ -181,13 +181,13 @@ def write_bop(root):
         "diameter": 86.6,
         "symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]],
     }
-    _write_json(root / "models" / "models_info.json", {"1": entry, "2": {"diameter": 86.6}})
-    _write_json(
+    write_json(root / "models" / "models_info.json", {"1": entry, "2": {"diameter": 86.6}})
+    write_json(
         root / "camera.json",
         {"fx": 300.0, "fy": 310.0, "cx": 40.0, "cy": 30.0, "width": 80, "height": 60},
     )
     targets = [(1, 0, 1), (2, 7, 1), (1, 6, 1)]  # the last is nowhere
-    _write_json(
+    write_json(
         root / "test_targets_bop19.json",
         [{"scene_id": s, "im_id": i, "obj_id": o, "inst_count": 1} for s, i, o in targets],
     )
@@ -223,6 +223,6 @@ def write_web(root):
     }
 
 
-def _write_json(path, content):
+def write_json(path, content):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content))

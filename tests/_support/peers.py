@@ -1,6 +1,5 @@
 """Folders as other tools lay them out, of one photograph and mesh whose pose is known."""
 
-import json
 import shutil
 
 import cv2
@@ -8,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch import render_depth
+from tests._support.miniature import write_json
 
 
 def write_peers(folder, photo, mesh, T, K):
@@ -37,13 +37,13 @@ def write_peers(folder, photo, mesh, T, K):
     (megapose / "meshes" / "truck").mkdir(parents=True)
     in_mm.export(megapose / "meshes" / "truck" / "truck.ply")
     cv2.imwrite(str(megapose / "image_rgb.png"), picture)
-    _write(megapose / "camera_data.json", {"K": K.tolist(), "resolution": [H, W]})
-    _write(
+    write_json(megapose / "camera_data.json", {"K": K.tolist(), "resolution": [H, W]})
+    write_json(
         megapose / "inputs" / "object_data.json",
         [{"label": "truck", "bbox_modal": [x0, y0, x1, y1]}],
     )
     pose = [quaternion, T[:3, 3].tolist()]
-    _write(megapose / "outputs" / "object_data.json", [{"label": "truck", "TWO": pose}])
+    write_json(megapose / "outputs" / "object_data.json", [{"label": "truck", "TWO": pose}])
 
     foundation = folder / "foundationpose"
     for name in ("rgb", "masks", "mesh", "ob_in_cam"):
@@ -66,10 +66,12 @@ def write_peers(folder, photo, mesh, T, K):
         "cam_t_m2c": (1000 * T[:3, 3]).tolist(),
         "obj_id": 1,
     }
-    _write(scene / "scene_gt.json", {"3": [entry]})
-    _write(scene / "scene_camera.json", {"3": {"cam_K": K.flatten().tolist(), "depth_scale": 1.0}})
+    write_json(scene / "scene_gt.json", {"3": [entry]})
+    write_json(
+        scene / "scene_camera.json", {"3": {"cam_K": K.flatten().tolist(), "depth_scale": 1.0}}
+    )
     found = {"scene_id": 1, "image_id": 3, "category_id": 1, "bbox": bbox, "score": 0.9}
-    _write(
+    write_json(
         folder / "bop" / "detections.json",
         [found, {**found, "category_id": 2, "bbox": [0, 0, 40, 40]}],
     )
@@ -86,12 +88,7 @@ def write_peers(folder, photo, mesh, T, K):
     names = ("1", "2")
     for name in names:
         (labels / f"{name}.txt").write_text(f"0 {line}\n")
-    _write(
+    write_json(
         folder / "boxes.json",
         [{"image_id": name, "category_id": 1, "bbox": bbox, "score": 0.8} for name in names],
     )
-
-
-def _write(path, content):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content))

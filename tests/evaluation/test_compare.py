@@ -38,13 +38,8 @@ def runs(tmp_path):
 
 def test_pairs_are_counted_and_a_sign_test_is_made(runs):
     comparisons = {each.score: each for each in compare(*map(read_run, runs))}
-    assert list(comparisons) == [
-        "acc_pi_6",
-        "acc_pi_18",
-        "symmetric_acc_pi_6",
-        "symmetric_acc_pi_18",
-        "med_err_deg",
-    ]
+    names = "acc_pi_6 acc_pi_18 symmetric_acc_pi_6 symmetric_acc_pi_18 med_err_deg"
+    assert list(comparisons) == names.split()
     # below 30 degrees: A 0 1 4 7, B 0 1 2 3 5 7
     within = comparisons["acc_pi_6"]
     assert (within.n, within.a, within.b, within.difference) == (8, 0.5, 0.75, 0.25)
@@ -82,14 +77,11 @@ def test_intervals_of_many_objects_are_narrow_and_hold_the_truth(tmp_path):
     """Of 1000 objects, about 600 and 700 are right: the standard error of the difference is
     0.02."""
     draw = np.random.default_rng(5)
-    errors = [
-        {str(k): 5.0 if draw.random() < share else 90.0 for k in range(1000)}
-        for share in (0.6, 0.7)
-    ]
-    pair = [
-        read_run(write_run(tmp_path / str(k), some, "web", ("error_deg",)))
-        for k, some in enumerate(errors)
-    ]
+    pair = []
+    for share in (0.6, 0.7):
+        errors = {str(k): 5.0 if draw.random() < share else 90.0 for k in range(1000)}
+        run = write_run(tmp_path / str(share), errors, "web", ("error_deg",))
+        pair.append(read_run(run))
     each = compare(*pair)[0]
     low, high = each.difference_interval
     assert 0.07 < high - low < 0.1
@@ -102,14 +94,8 @@ def test_average_recalls_of_bop_are_compared_by_object(tmp_path):
     first = write_run(tmp_path / "a", {"0": 0.26, "1": 0.04, "2": "inf"}, "bop", columns)
     second = write_run(tmp_path / "b", {"0": 0.21, "1": 0.04, "2": 0.6}, "bop", columns)
     found = {each.score: each for each in compare(read_run(first), read_run(second))}
-    assert list(found) == [
-        "acc_15_deg",
-        "acc_30_deg",
-        "add_recall_0.1d",
-        "mssd_ar",
-        "mspd_ar",
-        "med_err_deg",
-    ]
+    names = "acc_15_deg acc_30_deg add_recall_0.1d mssd_ar mspd_ar med_err_deg"
+    assert list(found) == names.split()
     recall = found["mssd_ar"]  # thresholds 0.05 to 0.5
     assert (recall.a, recall.b) == pytest.approx(((0.5 + 1.0) / 3, (0.6 + 1.0) / 3))
     assert (recall.wins, recall.losses) == (1, 0)
@@ -143,12 +129,8 @@ def test_the_command_prints_rows_for_tables(runs, capsys):
 
 def test_runs_that_cannot_be_compared_are_refused(runs, tmp_path):
     first = read_run(runs[0])
-    for name, settings in {
-        "root": {"root": "other"},
-        "split": {"split": "test"},
-        "dataset": {"dataset": "web"},
-    }.items():
-        other = read_run(write_run(tmp_path / name, A, **settings))
+    for name, other in {"root": "other", "split": "test", "dataset": "web"}.items():
+        other = read_run(write_run(tmp_path / name, A, **{name: other}))
         with refused(f"the {name} of one run is .*; give two runs of the same"):
             compare(first, other)
     with refused("no object in common"):

@@ -3,11 +3,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import Protocol
 from curvireg_torch.evaluation.protocol import hint_of_truth, perturbed_box
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import object_frame
+from tests._support import refused
 
 BOX = torch.tensor([10.0, 20.0, 110.0, 70.0])
 
@@ -59,14 +59,14 @@ def test_hint_of_truth_holds_the_truth_and_is_off_centre(hint):
 
 
 def test_a_seed_that_draws_nothing_is_refused():
-    with pytest.raises(InvalidInputError, match="protocol: seed: nothing is drawn"):
+    with refused("protocol: seed: nothing is drawn"):
         Protocol.parse(["seed=3"])
     for word in ("box=0.1", "hint=pose:5", "views=2"):
         assert Protocol.parse([word, "seed=3"]).seed == 3
 
 
 def test_a_key_that_is_given_twice_is_refused():
-    with pytest.raises(InvalidInputError, match="protocol: box is given twice"):
+    with refused("protocol: box is given twice"):
         Protocol.parse(["box=0.1", "box=0.2"])
 
 

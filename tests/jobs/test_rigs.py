@@ -20,6 +20,7 @@ from curvireg_torch.utils.files import only_in
 from tests._support import double, eye, refused
 from tests._support.doubling import check_linear
 from tests._support.lists import written
+from tests._support.spies import spied
 
 POSE = [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1]
 COLUMNS = "photo,camera," + ",".join((*rigs.ROTATION, *rigs.TRANSLATION))
@@ -62,26 +63,14 @@ def test_a_name_of_colmap_keeps_its_inner_blanks(tmp_path, images):
     images("  7  1 0 0 0   0 0 1  1   a  b.png \t\n\n")
     (view,) = read_rig(tmp_path)
     assert (view.name, view.photo) == ("image a  b.png", tmp_path / "a  b.png")
-    for line in (
-        "1 1 0 0 0 0 0 1 1",
-        "1 1 0 0 0 0 0 1 x a.png",
-        "x 1 0 0 0 0 0 1 1 a.png",
-        "1 1 0 0 0 0 0 x 1 a.png",
-    ):
-        images(line)
+    for line in ("1 {} 1 1", "1 {} 1 x a.png", "x {} 1 1 a.png", "1 {} x 1 a.png"):
+        images(line.format("1 0 0 0 0 0"))
         with refused(r"images\.txt: expected IMAGE_ID QW"):
             read_rig(tmp_path)
 
 
 def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path, monkeypatch):
-    read = []
-    content = calibrations.read_document
-
-    def counted(file):
-        read.append(file.name)
-        return content(file)
-
-    monkeypatch.setattr(calibrations, "read_document", counted)
+    read = spied(monkeypatch, calibrations, "read_document")
     camera = {"camera_matrix": [300.0, 0, 1, 0, 300, 1, 0, 0, 1]}
     (tmp_path / "a.json").write_text(json.dumps({f"c{k}": camera for k in range(5)}))
     (tmp_path / "b.json").write_text(json.dumps(camera))
@@ -90,22 +79,20 @@ def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path
         tmp_path / "rig.csv", COLUMNS, *([f"{k}.png", name, *POSE] for k, name in enumerate(names))
     )
     assert len(read_rig(rig)) == 7
-    assert sorted(read) == ["a.json", "b.json"]
+    assert sorted(file.name for (file,) in read) == ["a.json", "b.json"]
     read.clear()
     rows = [[f"{k}.png", 0, 0, 9, 9, name] for k, name in enumerate(names)]
     photos = written(tmp_path / "list.csv", "photo,x0,y0,x1,y1,camera", *rows)
     entries = read_list(photos, RegisterOptions(meshes=(tmp_path / "a.ply",)))
     assert [entry.error for entry in entries] == [""] * 7
-    assert sorted(read) == ["a.json", "b.json"]
+    assert sorted(file.name for (file,) in read) == ["a.json", "b.json"]
     read.clear()
-    (tmp_path / "cameras.txt").write_text(
-        "\n".join(LINE.replace("1 ", f"{k} ", 1) for k in range(7))
-    )
-    (tmp_path / "images.txt").write_text(
-        "".join(f"{k} 1 0 0 0 0 0 1 {k} {k}.png\n\n" for k in range(7))
-    )
+    cameras = [LINE.replace("1 ", f"{k} ", 1) for k in range(7)]
+    (tmp_path / "cameras.txt").write_text("\n".join(cameras))
+    images = [f"{k} 1 0 0 0 0 0 1 {k} {k}.png\n\n" for k in range(7)]
+    (tmp_path / "images.txt").write_text("".join(images))
     assert len(read_rig(tmp_path)) == 7
-    assert read == ["cameras.txt"]
+    assert [file.name for (file,) in read] == ["cameras.txt"]
 
 
 def test_rigs_and_lists_are_bounded(tmp_path, monkeypatch):
@@ -214,11 +201,9 @@ def write_scene(folder, **parts):
         (folder / f"scene_{name}.json").write_text(json.dumps(content))
 
 
-@pytest.mark.parametrize(
-    "truth", [{"0": {"obj_id": 5}}, {"0": [5]}, {"0": ["obj_id"]}, {"0": "obj_id"}]
-)
+@pytest.mark.parametrize("truth", [{"obj_id": 5}, [5], ["obj_id"], "obj_id"])
 def test_ground_truth_of_bop_of_another_shape_is_refused(tmp_path, truth):
-    write_scene(tmp_path, camera={"0": CAMERA}, gt=truth)
+    write_scene(tmp_path, camera={"0": CAMERA}, gt={"0": truth})
     with refused(r"image 0: expected a list of objects in scene_gt\.json"):
         read_rig(tmp_path, Path("obj_000005.ply"))
 

@@ -13,17 +13,17 @@ from scripts.confidence_table import (
     table_of_withheld,
 )
 
+ROWS = """\
+{"key": "a", "confidence": 0.95, "reliable": true, "ambiguous": null}
+{"key": "b", "confidence": 0.97, "reliable": true, "ambiguous": "several"}
+{"key": "c", "confidence": 0.31, "reliable": false, "ambiguous": "half turn"}
+{"key": "d", "verdict": "failed"}
+"""
+
 
 def run(folder, column):
-    results = [
-        {"key": "a", "confidence": 0.95, "reliable": True, "ambiguous": None},
-        {"key": "b", "confidence": 0.97, "reliable": True, "ambiguous": "several"},
-        {"key": "c", "confidence": 0.31, "reliable": False, "ambiguous": "half turn"},
-        {"key": "d", "verdict": "failed"},
-    ]
     folder.mkdir()
-    lines = [json.dumps(row) + "\n" for row in results]
-    (folder / "results.jsonl").write_text("".join(lines), encoding="utf-8")
+    (folder / "results.jsonl").write_text(ROWS, encoding="utf-8")
     errors = f"key,group,{column}\na,1,29.9\nb,1,30.1\nc,2,3.0\nd,2,\n"
     (folder / "errors.csv").write_text(errors, encoding="utf-8")
     return folder

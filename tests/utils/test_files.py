@@ -1,4 +1,5 @@
 import csv
+import math
 import os
 import signal
 import sys
@@ -134,16 +135,8 @@ def test_read_json_refuses_malicious_missing_and_large_files(tmp_path):
 
 def test_finite_numbers_accepts_finite_numbers_only():
     assert files.finite_numbers([1, 2.5], 2) == (1.0, 2.5)
-    for values in (
-        [1],
-        [1, True],
-        [1, "2"],
-        [1, float("nan")],
-        [1, 10**400],
-        "12",
-        {"a": 1, "b": 2},
-        None,
-    ):
+    pairs = ([1, wrong] for wrong in (True, "2", math.nan, 10**400))
+    for values in (*pairs, [1], "12", {"a": 1, "b": 2}, None):
         assert files.finite_numbers(values, 2) is None
 
 
@@ -215,11 +208,7 @@ def test_a_name_is_found_however_its_accents_are_stored(tmp_path, stored):
     file.write_text("")
     forms = ["NFC", "NFD"]
     for form in forms:
-        typed = (
-            tmp_path
-            / unicodedata.normalize(form, "Möbel")
-            / unicodedata.normalize(form, "Stühle.png")
-        )
+        typed = tmp_path / unicodedata.normalize(form, "Möbel/Stühle.png")
         assert as_stored(typed) == file
         assert found_in(tmp_path)(str(typed.relative_to(tmp_path))) == file
         other = typed.with_name("Stuhle.png")
