@@ -17,6 +17,7 @@ from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from tests._support import bank_of, double, scene, slow_after, truck_bank
 from tests._support.lists import CAMERA, box_of, check_pose
+from tests._support.tables import text_table
 
 
 @pytest.mark.usefixtures("drawn")
@@ -46,13 +47,8 @@ def test_register_is_told_that_a_box_is_that_of_the_visible_part(register_one, d
 
 
 def test_register_without_box_and_camera(folder, register_one, document, capsys):
-    words = [
-        "register",
-        str(folder / "photos/0.png"),
-        str(folder / "truck.safetensors"),
-        "--no-refine",
-        "--json",
-    ]
+    files = [str(folder / name) for name in ("photos/0.png", "truck.safetensors")]
+    words = ["register", *files, "--no-refine", "--json"]
     assert main([*words, "--box", *box_of(0)]) == 0
     assert "detecting" not in capsys.readouterr().err
     assert main(words) == 0
@@ -194,54 +190,6 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
     )
 
 
-IGNORED = [
-    # words of register; part of the message
-    ("a.png m.ply --preset fast --pipeline p.json", "expected one of --preset and --pipeline"),
-    ("a.png m.ply --start s.json --camera exif --instances 2", "leave --instances out"),
-    ("a.png m.ply --start s.json --camera exif --hypotheses 2", "leave --hypotheses out"),
-    ("--views rig.csv m.ply --instances 2", "leave --instances out"),
-    ("a.png m.ply --jobs 2", "--jobs: several processes share several photographs"),
-    ("--views rig.csv m.ply --jobs 2", "--jobs: several processes share several photographs"),
-    ("a.png m.ply --scheduler tcp://x:1", "--scheduler: several processes share several"),
-    ("a.png b.png m.ply --jobs 2 --scheduler tcp://x:1", "one of --jobs and --scheduler"),
-    ("a.png b.png m.ply --jobs 2 --device cuda", "--jobs: processes are for the CPU"),
-    ("a.png m.ply --every 2", "--every applies to the frames of videos"),
-    ("a.png b.png m.ply --every 2", "--every applies to the frames of videos"),
-    ("--list l.csv m.ply --every 2", "--every applies to the frames of videos"),
-    ("a.png m.ply --front x", "--front limits nothing"),
-]
-OF_OTHERS = [
-    *(
-        f"{command} --camera 1 1 1 1 --fov 50"
-        for command in ("plot overlay a.png m.ply", "follow v.mp4 m.ply", "view")
-    ),
-    *(
-        f"{command} --preset fast --pipeline p.json"
-        for command in ("plot overlay a.png m.ply", "view", "demo", "bank m.ply")
-    ),
-    *(f"evaluate {name} . --preset fast --pipeline p.json" for name in ("bop", "web", "pascal3d")),
-    *(
-        "follow v.mp4 m.ply --box 1 2 3 4 --start s.json",
-        "plot overlay a.png m.ply --front x",
-        "view --front x",
-    ),
-]
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        *((f"register {words}", message) for words, message in IGNORED),
-        *((line, "") for line in OF_OTHERS),
-    ],
-)
-def test_options_that_would_be_ignored_are_refused(line, message, capsys):
-    with pytest.raises(SystemExit) as stop:
-        parse([*line.split(), *([] if line.startswith("view") else ["--out", "out"])])
-    assert stop.value.code == 2
-    assert message in capsys.readouterr().err.splitlines()[-1]
-
-
 def test_options_of_videos_and_processes_are_taken():
     for words in (
         "a.png v.mp4 m.ply --every 2",
@@ -313,19 +261,24 @@ def inputs_with(*, box=(300, 200, 500, 400), **picture):
     return {"inputs": {"box": box, "picture": picture}}
 
 
+ADVICE = """
+{"warnings": ["?"]}                                        | what the warning names
+{"verdict": "unsure"}                                      | look whether its contours fit
+{}                                                         | check that the box is tight, and that
+{"ambiguous": "half turn"}                                 | more than one pose
+{"confidence_features": {"border": 1}}                     | border of the photograph
+{"translation": null}                                      | --camera
+{"confidence_features": {"border": 0, "undetermined": 1.2}} | rotation open
+"""
+
+
 def test_advice_names_what_was_measured_or_says_less():
     document = {"warnings": [], "ambiguous": None, "translation": [0, 0, 1], "edge_support": 0.1}
     document |= {"verdict": "no match"}
     document["confidence_features"] = {"border": 0, "undetermined": 0.1}
     assert "contours" not in _advice(document), "few edges alone are no cause"
     for change, words in (
-        ({"warnings": ["?"]}, "what the warning names"),
-        ({"verdict": "unsure"}, "look whether its contours fit in the overlay"),
-        ({}, "check that the box is tight, and that the mesh is the object's"),
-        ({"ambiguous": "half turn"}, "more than one pose"),
-        ({"confidence_features": {"border": 1}}, "border of the photograph"),
-        ({"translation": None}, "--camera"),
-        ({"confidence_features": {"border": 0, "undetermined": 1.2}}, "rotation open"),
+        *text_table(ADVICE),
         (inputs_with(box=[34.8, 20.3, 74, 79.7]), "of percent, divide it by 100"),
         (inputs_with(box=[34.8, 20.3, 174, 79.7]), "check that the box is tight"),
         (inputs_with(width=90, box=[34, 20, 74, 79]), "check that the box is tight"),
