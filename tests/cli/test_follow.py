@@ -20,6 +20,8 @@ from tests._support import learned_registrar, sequence, slow_after, write_photo,
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, check_pose, table
 from tests._support.results import registration
+from tests._support.spies import spied
+from tests._support.tables import text_table
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +42,14 @@ def frames(tmp_path_factory):
     return folder, scenes
 
 
+def check_poses(folder, frames, degrees=4.0, share=0.04):
+    """Check the poses of the frames in a folder's results; returns the rows."""
+    rows = table(folder)
+    for row, (_, _, T) in zip(rows, frames[1], strict=False):
+        check_pose(row, T, degrees, share)
+    return rows
+
+
 @pytest.fixture
 def follow(frames):
     """Run ``curvireg follow``, by default on the folder, with the box of the first frame, or from
@@ -56,15 +66,15 @@ def follow(frames):
     return run
 
 
-@pytest.mark.parametrize(
-    ("confidences", "said"),
-    [
-        ((0.1, 0.2, 0.409, 0.3), ["", "", "not sure of the object yet (best confidence 0.40)", ""]),
-        ((0.1, 0.5, 0.3, 0.3), [""] * 4),
-        ((0.1, None, None), ["", "", "not sure of the object yet (best confidence 0.10)"]),
-        ((None, None, None), ["", "", "not sure of the object yet"]),
-    ],
-)
+DOUBTS = """
+[0.1, 0.2, 0.409, 0.3] | ["", "", "not sure of the object yet (best confidence 0.40)", ""]
+[0.1, 0.5, 0.3, 0.3]   | ["", "", "", ""]
+[0.1, null, null]      | ["", "", "not sure of the object yet (best confidence 0.10)"]
+[null, null, null]     | ["", "", "not sure of the object yet"]
+"""
+
+
+@pytest.mark.parametrize(("confidences", "said"), text_table(DOUBTS))
 def test_frames_without_a_certain_pose_are_spoken_of_once(confidences, said):
     tally = Tally()
     for confidence, words in zip(confidences, said, strict=True):
@@ -87,10 +97,8 @@ def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     rate = re.search(r", ([\d.]+) frames per second; see", closing)
     assert rate is not None
     assert float(rate[1]) > 0.0
-    rows = table(tmp_path)
+    rows = check_poses(tmp_path, frames)
     assert [row["verdict"] for row in rows] == ["reliable"] * 3 + ["failed"]
-    for row, (_, _, T) in zip(rows, scenes, strict=False):
-        check_pose(row, T, 4.0, 0.04)
     assert all(0.5 <= float(row["confidence"]) <= 1.0 for row in rows[:3])
     assert (rows[3]["r11"], rows[3]["confidence"], rows[0]["message"]) == ("", "", "")
     assert "3.png" in rows[3]["message"]
@@ -102,20 +110,16 @@ def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
 
 @pytest.fixture
 def boxes(monkeypatch):
-    """The boxes that a follower is given."""
-    given = []
-    call = Follower.__call__
-    monkeypatch.setattr(
-        Follower, "__call__", lambda self, image, box: given.append(box) or call(self, image, box)
-    )
-    return given
+    """A function that returns the boxes that a follower was given."""
+    calls = spied(monkeypatch, Follower, "__call__")
+    return lambda: [box for _, _, box in calls]
 
 
 def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(
     frames, follow, boxes, tmp_path, capsys
 ):
     assert follow("--camera", *CAMERA, "--out", tmp_path, "--json", source="turn.avi") == 0
-    assert boxes == [frames[1][0][1].tolist(), None, None]
+    assert boxes() == [frames[1][0][1].tolist(), None, None]
     printed = capsys.readouterr()
     assert "3 frames: 3 reliable, 0 unsure" in printed.err
     lines = [json.loads(line) for line in printed.out.splitlines()]
@@ -152,15 +156,13 @@ def test_follow_takes_the_boxes_of_a_detector_by_frame(frames, follow, boxes, tm
     (labels / "turn-000002.txt").write_text("0 0.5 0.5 0.5 0.5\n")
     words = ["--camera", *CAMERA, "--boxes", labels, "--out", tmp_path / "out"]
     assert follow(*words, source="turn.avi", box=False) == 0
-    assert boxes[0] == pytest.approx(scenes[0][1].tolist(), abs=1e-3)
-    assert boxes[1:] == [None, [59.5, 44.5, 179.5, 134.5]]
+    expected = pytest.approx(scenes[0][1].tolist(), abs=1e-3)
+    assert boxes() == [expected, None, [59.5, 44.5, 179.5, 134.5]]
     check_pose(table(tmp_path / "out")[0], scenes[0][2], 4.0, 0.04)
     numbers = yolo.split()[1:]
     more = ["--box", *numbers, "--box-format", "yolo", "--out", tmp_path / "more"]
-    boxes.clear()
     assert follow("--camera", *CAMERA, *more, source="turn.avi", box=False) == 0
-    assert boxes[0] == pytest.approx(scenes[0][1].tolist(), abs=1e-3)
-    assert boxes[1:] == [None, None]
+    assert boxes()[3:] == [expected, None, None]
 
 
 @pytest.mark.parametrize("source", slow_after(1, ["rtsp://camera/stream", "0"]))
@@ -192,8 +194,7 @@ def test_follow_guesses_the_camera_from_the_first_frame(
     monkeypatch.setattr(data, "read_photo", read)
     assert follow(*words.split(), "--out", tmp_path) == 0
     assert [call.args[0].name for call in read.call_args_list] == [f"{k}.png" for k in range(4)]
-    for row, (_, _, T) in zip(table(tmp_path), frames[1], strict=False):
-        check_pose(row, T, 4.0, 0.04)
+    check_poses(tmp_path, frames)
 
 
 @pytest.mark.parametrize("kind", slow_after(1, ["file", "exif"]))
@@ -224,15 +225,13 @@ def test_follow_takes_the_exif_data_unasked_and_else_estimates_the_camera(
 ):
     assert follow("--out", tmp_path / "exif") == 0
     assert "camera: from the file's EXIF" in capsys.readouterr().out
-    for row, (_, _, T) in zip(table(tmp_path / "exif"), frames[1], strict=False):
-        check_pose(row, T, 4.0, 0.1)
+    check_poses(tmp_path / "exif", frames, 4.0, 0.1)
     assert follow("--out", tmp_path / "none", source="turn.avi") == 0
     assert "camera: focal length estimated" in capsys.readouterr().out
-    rows = table(tmp_path / "none")
-    zooms = []
-    for row, (_, _, T) in zip(rows, frames[1], strict=False):
-        check_pose(row, T, 8.0, 0.5)
-        zooms.append(float(row["tz"]) / float(T[2, 3]))
+    rows = check_poses(tmp_path / "none", frames, 8.0, 0.5)
+    zooms = [
+        float(row["tz"]) / float(T[2, 3]) for row, (_, _, T) in zip(rows, frames[1], strict=False)
+    ]
     assert max(zooms) < 1.05 * min(zooms), "one camera for all frames"
     assert follow("--mesh-is", "similar", "--out", tmp_path / "other") == 2
     assert "needs the camera with --mesh-is similar" in capsys.readouterr().err
@@ -245,13 +244,8 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(
     frames, follow, tmp_path, monkeypatch, confidence, verdict
 ):
     """No registration confirms a doubtful one here."""
-    T = frames[1][0][2]
-    pose = {
-        "rotation": T[:3, :3].tolist(),
-        "translation": T[:3, 3].tolist(),
-        "confidence": confidence,
-    }
-    (tmp_path / "start.json").write_text(json.dumps(pose))
+    pose = json.loads((frames[0] / "start.json").read_text())
+    (tmp_path / "start.json").write_text(json.dumps(pose | {"confidence": confidence}))
     refined = Follower._refined
 
     def unconfirmed(self, item, starts):
@@ -264,10 +258,7 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(
     monkeypatch.setattr(Follower, "_refined", unconfirmed)
     words = ["--camera", *CAMERA, "--start", tmp_path / "start.json", "--out", tmp_path / "out"]
     assert follow(*words, box=False) == 0
-    rows = table(tmp_path / "out")
-    for row, (_, _, T) in zip(rows, frames[1], strict=False):
-        check_pose(row, T, 4.0, 0.04)
-    assert rows[0]["verdict"] == verdict
+    assert check_poses(tmp_path / "out", frames)[0]["verdict"] == verdict
 
 
 @pytest.mark.parametrize(("source", "code"), [("shots", 130), ("0", 0)])

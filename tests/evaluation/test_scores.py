@@ -16,6 +16,9 @@ from curvireg_torch.jobs.store import ResultStore, to_json
 from tests._support import double, refused
 from tests._support.lists import bop_poses, table
 from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
+from tests._support.tables import text_table
+
+ANY = Protocol(pose="any")
 
 SECONDS = {"bank": 2.0, "register": 0.5}
 PICTURE = {"width": 80, "height": 60}
@@ -211,7 +214,7 @@ def test_score_without_results(tmp_path, instances, furniture, kind):
 
 
 def test_pose_folders_score_known_poses(web):
-    benchmark = PoseFolderBenchmark(web, Protocol(pose="any"))
+    benchmark = PoseFolderBenchmark(web, ANY)
     half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     first, _, third, _ = (sample["rotation"] for sample in benchmark.samples)
     poses = [(first, 0.75), (half, 0.25), (third @ half, 0.5)]
@@ -313,7 +316,7 @@ def test_the_page_marks_by_the_error_up_to_symmetries(furniture, bop, tmp_path):
     assert '<figure class="right">' in page
     assert "0.0 degrees off" in page
     assert "1 of 1 within 30 degrees" in page
-    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    benchmark = BOPBenchmark(bop, ANY)
     pose = {"rotation": rotated(benchmark.samples[0], "z", 180), "translation": [0.0, 0.0, 500.0]}
     scores_of(benchmark, tmp_path / "bop", [pose, *[{"skipped": "x"}] * 3])
     page = (tmp_path / "bop" / "index.html").read_text()
@@ -380,7 +383,7 @@ def test_bop_errors_are_of_the_models_of_the_challenge(instances, tmp_path):
 
 @pytest.mark.parametrize(("folder", "name"), [("lm", "lm"), ("my-own_set", "myownset")])
 def test_results_have_the_name_that_the_toolkit_takes_apart(bop, tmp_path, folder, name):
-    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    benchmark = BOPBenchmark(bop, ANY)
     bop.root = tmp_path / folder
     bop.split = "test_primesense"
     (tmp_path / "out").mkdir()
@@ -397,15 +400,15 @@ def test_an_object_that_is_visible_by_95_per_cent_is_unoccluded(instances):
     assert benchmark.subsets(samples) == {"unoccluded": [False, True, True, False]}
 
 
-@pytest.mark.parametrize(
-    ("annotated", "proposed"),
-    [
-        ((10.0, 79.5, 30.0, 159.5), (10.0, 89.5, 30.0, 99.5)),
-        ((179.5, 10.0, 259.5, 30.0), (189.5, 10.0, 199.5, 30.0)),
-        ((10.0, -80.5, 30.0, 19.5), (10.0, -0.5, 30.0, 9.5)),
-        ((-80.5, 10.0, 19.5, 30.0), (-0.5, 10.0, 9.5, 30.0)),
-    ],
-)
+CLIPPED = """
+[10.0, 79.5, 30.0, 159.5]  | [10.0, 89.5, 30.0, 99.5]
+[179.5, 10.0, 259.5, 30.0] | [189.5, 10.0, 199.5, 30.0]
+[10.0, -80.5, 30.0, 19.5]  | [10.0, -0.5, 30.0, 9.5]
+[-80.5, 10.0, 19.5, 30.0]  | [-0.5, 10.0, 9.5, 30.0]
+"""
+
+
+@pytest.mark.parametrize(("annotated", "proposed"), text_table(CLIPPED))
 def test_boxes_are_clipped_where_the_outermost_pixels_end(annotated, proposed):
     """At -0.5, and 99.5 of 100 rows: half of what is then left of the annotated box is proposed."""
     assert detection_recall([[sample(*annotated)]], [located(proposed)])["recall_1"] == 1.0
