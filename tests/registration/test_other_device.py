@@ -9,7 +9,7 @@ from curvireg_torch.rendering.visibility import FaceTests
 from curvireg_torch.rendering.zbuffer import DeviceRenderer
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.terms import Appearance
-from tests._support import CAMERA, learned_registrar, scene
+from tests._support import CAMERA, exact_registrar, learned_registrar, scene
 
 VIEWS = cr.sample_views(azimuth_step=45, elevations=[0, 30])
 AGREES = 0.05  # degrees
@@ -39,7 +39,7 @@ def check_agreement(results, expected):
 def test_a_registration_is_computed_on_one_device(elsewhere):
     images, boxes = photographs(2)
     expected = learned_registrar()(images, boxes, CAMERA)
-    registrar = cr.Registrar(learned_registrar().bank.to(elsewhere))
+    registrar = exact_registrar(learned_registrar().bank.to(elsewhere))
     check_agreement(registrar(images, boxes, CAMERA), expected)
 
 
@@ -71,7 +71,7 @@ def test_photographs_in_a_block_have_the_poses_that_they_have_alone(monkeypatch)
     """The backend of devices, on the CPU."""
     images, boxes = photographs(3)
     expected = learned_registrar()(images, boxes, CAMERA)
-    registrar = cr.Registrar(learned_registrar().bank)
+    registrar = exact_registrar(learned_registrar().bank)
     describer = registrar.describer
     monkeypatch.setattr("curvireg_torch.rendering.contours._visibility", FaceTests)
     describer.__dict__["contours"] = MeshContours(describer.view_mesh)
