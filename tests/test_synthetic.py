@@ -5,11 +5,10 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar, rotation_error, synthetic
-from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import demo_scene, example_mesh, random_pose, synthesize_photograph
-from tests._support import CAMERA, SIZE, eye, seeded
+from tests._support import CAMERA, SIZE, eye, refused, seeded
 
 
 def test_photograph_shows_the_colours_of_the_mesh_at_its_pose_which_must_show_the_object():
@@ -28,7 +27,7 @@ def test_photograph_shows_the_colours_of_the_mesh_at_its_pose_which_must_show_th
     assert (box - inside).abs().max() < 1
     behind = eye(4)
     behind[2, 3] = -1.0
-    with pytest.raises(InvalidInputError, match="no pixel"):
+    with refused("no pixel"):
         synthesize_photograph(example_mesh(), behind, CAMERA, SIZE, torch.Generator())
 
 

@@ -8,13 +8,21 @@ import trimesh
 
 from curvireg_torch import Camera, rotation_error
 from curvireg_torch.cli import main, parse
-from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
+from curvireg_torch.errors import MeshError, RenderingError
 from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Registrar
-from tests._support import double, eye
-from tests._support.lists import bop_poses, table
+from tests._support import double, eye, refused
+from tests._support.lists import bop_poses, lines, table
 from tests._support.small import SMALL, rows_of, run
+from tests._support.spies import spied
+
+ANY = Protocol(pose="any")
+
+
+def summary_in(folder):
+    """The summary of the run in ``folder / "out"``."""
+    return json.loads((folder / "out" / "summary.json").read_text())
 
 
 def test_evaluate_pascal3d(pascal, tmp_path):
@@ -41,31 +49,23 @@ def test_evaluate_pascal3d(pascal, tmp_path):
     R = double(good["rotation"])
     torch.testing.assert_close(R @ R.T, eye(3), atol=1e-6, rtol=0)
     files = {p.name for p in (tmp_path / "out").iterdir()} - {MARKER}
-    assert files == {
-        "results.jsonl",
-        "predictions.csv",
-        "errors.csv",
-        "summary.json",
-        "index.html",
-        "thumbnails",
-    }
+    expected = "results.jsonl predictions.csv errors.csv summary.json index.html thumbnails"
+    assert files == {*expected.split()}
     assert (tmp_path / "out" / "index.html").read_text().count("<img") == 3
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["protocol"] == str(
-        Protocol()
-    )
+    assert summary_in(tmp_path)["protocol"] == str(Protocol())
 
 
 def test_evaluate_bop(bop, tmp_path):
-    summary = run(BOPBenchmark(bop, Protocol(pose="any")), tmp_path / "out")
+    summary = run(BOPBenchmark(bop, ANY), tmp_path / "out")
     assert (summary["n"], summary["failed"]) == (4, 1), "one photograph is of one colour"
-    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    benchmark = BOPBenchmark(bop, ANY)
     nowhere = {**benchmark.samples[3], "box": torch.full((4,), torch.nan)}
     benchmark.entries[3] = benchmark._entry(nowhere)
     assert run(benchmark, tmp_path / "unknown")["skipped"]["unknown_box"] == 1
     assert not BOPBenchmark(bop, Protocol(pose="any", box=None))._entry(nowhere).error
-    table = bop_poses(tmp_path / "out" / "predictions.csv")
-    assert len(table) == 3
-    assert all(row["t"][2] > 0 for row in table)
+    poses = bop_poses(tmp_path / "out" / "predictions.csv")
+    assert len(poses) == 3
+    assert all(row["t"][2] > 0 for row in poses)
 
 
 def test_boxes_of_visible_parts_reach_the_registrar_with_what_they_are(bop, tmp_path):
@@ -76,13 +76,13 @@ def test_boxes_of_visible_parts_reach_the_registrar_with_what_they_are(bop, tmp_
     without = {k: v for k, v in benchmark.samples[0].items() if k != "box_visible"}
     assert benchmark._entry(without).error == "unknown_box"
     known = {**benchmark.samples[0], "box_visible": seen}
-    assert BOPBenchmark(bop, Protocol(pose="any"))._entry(known).box != (1, 2, 30, 40)
+    assert BOPBenchmark(bop, ANY)._entry(known).box != (1, 2, 30, 40)
     summary = run(benchmark, tmp_path, limit=1)
     assert summary["settings"]["pipeline"]["box_is"] == "visible"
 
 
 def test_objects_fail_alone(bop, tmp_path):
-    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    benchmark = BOPBenchmark(bop, ANY)
     first, second, third = benchmark.entries[:3]
     benchmark.entries[0] = replace(
         first, camera=Camera(torch.diag(torch.tensor([400.0, 300.0, 1.0])))
@@ -135,13 +135,10 @@ def test_defects_end_the_run(pascal, tmp_path, monkeypatch):
 def test_protocol_and_pipeline_reach_the_registrar(pascal, tmp_path, monkeypatch):
     # a second CAD of a car
     trimesh.creation.box((0.2, 0.9, 0.2)).export(pascal.root / "CAD" / "car" / "02.off")
-    registrars = []
-    init = Registrar.__init__
-    monkeypatch.setattr(
-        Registrar, "__init__", lambda self, *a, **k: registrars.append(self) or init(self, *a, **k)
-    )
+    made = spied(monkeypatch, Registrar, "__init__")
     benchmark = Pascal3DBenchmark(pascal, Protocol(cad="any"))
     run(benchmark, tmp_path, pipeline=replace(SMALL, box_jitter=0.05), limit=1)
+    registrars = [given[0] for given in made]
     assert len(registrars[0].others or registrars[-1].others) == 1
     for registrar in registrars:
         assert (registrar.pipeline.box_jitter, registrar.pipeline.views.pose) == (0.05, "upright")
@@ -155,11 +152,11 @@ def test_evaluate_web_tells_known_from_unknown_poses(web, tmp_path, capsys):
     assert "acc_15_deg" in out
     assert "the true pose of 2 is known" in out
     assert "pose=any" in out
-    lines = table(tmp_path, "predictions.csv")
-    assert [line["category"] for line in lines] == ["cup"] * 3 + ["shoe"]
-    assert [line["true_azimuth"] for line in lines] == ["30", "", "90", ""]
-    assert [bool(line["error_deg"]) for line in lines] == [True, False, True, False]
-    assert all(line["azimuth"] for line in lines)
+    rows = table(tmp_path, "predictions.csv")
+    assert [row["category"] for row in rows] == ["cup"] * 3 + ["shoe"]
+    assert [row["true_azimuth"] for row in rows] == ["30", "", "90", ""]
+    assert [bool(row["error_deg"]) for row in rows] == [True, False, True, False]
+    assert all(row["azimuth"] for row in rows)
     for name in ("no_mesh", "no_table", "other_table", "cup"):
         for path in (web.root / name).iterdir():
             path.unlink()
@@ -184,7 +181,7 @@ def evaluate(tmp_path):
     def run(*words):
         arguments = parse(["evaluate", *map(str, words), "--out", str(tmp_path / "out"), "--quiet"])
         arguments.run(arguments)
-        return json.loads((tmp_path / "out" / "summary.json").read_text())
+        return summary_in(tmp_path)
 
     return run
 
@@ -197,10 +194,10 @@ def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_fi
     summary = evaluate(*words)
     assert list(summary["per_class"]) == ["car"]
     assert (summary["n"], summary["protocol"]) == (3, "cad=annotated pose=upright box=annotated")
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-3].startswith("3 objects, 0 failed, ")
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[-3].startswith("3 objects, 0 failed, ")
     numbers = f"acc_pi_6 {summary['acc_pi_6']:.3f}   acc_pi_18 {summary['acc_pi_18']:.3f}   "
-    assert lines[-2].startswith(numbers)
+    assert printed[-2].startswith(numbers)
     (tmp_path / "pipeline.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
     settings = evaluate("pascal3d", pascal.root, "--pipeline", tmp_path / "pipeline.json")[
         "settings"
@@ -212,9 +209,9 @@ def test_evaluate_keeps_the_views_of_the_preset_paper(pascal, evaluate, tmp_path
     """Which take seconds to render: no mesh is read here."""
     broken = Mock(side_effect=MeshError("broken"))
     monkeypatch.setattr("curvireg_torch.evaluation.datasets.cached_bank", broken)
-    with pytest.raises(InvalidInputError, match="nothing was scored"):
+    with refused("nothing was scored"):
         evaluate("pascal3d", pascal.root, "--preset", "paper")
-    settings = json.loads((tmp_path / "out" / "summary.json").read_text())["settings"]
+    settings = summary_in(tmp_path)["settings"]
     assert (settings["preset"], settings["protocol"].split()[1]) == ("paper", "pose=upright")
     views = settings["pipeline"]["views"]
     assert (views["pose"], views["frame"]) == ("paper", "principal")
@@ -240,16 +237,13 @@ def test_evaluate_without_boxes_reports_detection(pascal, evaluate, tmp_path, ca
     summary = evaluate(*words)
     assert summary["detection"]["n"] == 2
     assert f"recall_1 {summary['detection']['recall_1']:.3f}   recall_5" in capsys.readouterr().out
-    rows = [
-        json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()
-    ]
-    row = next(row for row in rows if "detection" in row)
+    row = next(row for row in lines(tmp_path / "out") if "detection" in row)
     assert row["detection"]["proposals"][0]["box"] in boxes
 
 
 def test_evaluate_reports_when_nothing_was_scored(pascal, evaluate, tmp_path):
     for photograph in (pascal.root / "Images").rglob("*.jpg"):
         photograph.write_bytes(b"")
-    with pytest.raises(InvalidInputError, match=r"nothing was scored .*unreadable_image"):
+    with refused(r"nothing was scored .*unreadable_image"):
         evaluate("pascal3d", pascal.root)
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["n"] == 0
+    assert summary_in(tmp_path)["n"] == 0

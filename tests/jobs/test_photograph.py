@@ -20,6 +20,9 @@ from tests._support import found_in, learned_registrar, refused, scene, two_truc
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, write_files
 
+BOX = [*map(float, box_of(0))]
+FOUR = [*map(float, CAMERA)]
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
@@ -29,10 +32,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def result(folder):
     photo = folder / "photos" / "0.png"
-    box = [float(v) for v in box_of(0)]
-    return cr.register(
-        str(photo), str(folder / "learned.safetensors"), box=box, camera=[float(v) for v in CAMERA]
-    )
+    return cr.register(str(photo), str(folder / "learned.safetensors"), box=BOX, camera=FOUR)
 
 
 def test_register_equals_the_command_to_the_last_digit_and_saves_its_files(
@@ -56,27 +56,23 @@ def test_register_equals_the_command_to_the_last_digit_and_saves_its_files(
 
 def test_register_takes_pictures_of_other_kinds(folder, result):
     registrar = learned_registrar()
-    box = box_of(0)
-    numbers = [float(v) for v in box]
     with Image.open(folder / "photos" / "0.png") as picture:
         pixels = np.array(picture.convert("RGB"))
-        four = np.array(list(map(float, CAMERA)))
+        four = np.array(FOUR)
         for image, camera in (
             (picture, cr.camera_matrix(*four)),
             (pixels, four),
             (torch.from_numpy(pixels).permute(2, 0, 1), torch.from_numpy(four)),
         ):
-            same = cr.register(image, registrar, box=numbers, camera=camera)
+            same = cr.register(image, registrar, box=BOX, camera=camera)
             assert same.rotation.equal(result.rotation)
 
 
 @pytest.mark.slow
 def test_register_detects_the_object_without_a_box(folder):
-    found = cr.register(
-        folder / "photos" / "0.png", learned_registrar(), camera=tuple(map(float, CAMERA))
-    )
+    found = cr.register(folder / "photos" / "0.png", learned_registrar(), camera=FOUR)
     assert cr.rotation_error(found.rotation, scene(0)[2][:3, :3]) < 5
-    expected = torch.tensor([float(v) for v in box_of(0)])
+    expected = torch.tensor(BOX)
     assert (found.box - expected).abs().max() < 12
 
 
@@ -84,9 +80,7 @@ def test_register_takes_the_camera_from_exif(folder):
     photo = folder / "exif.png"
     cv2.imwrite(str(photo), cv2.imread(str(folder / "photos" / "0.png")))
     with_exif(photo, exif(1, 38))
-    guessed = cr.register(
-        photo, learned_registrar(), box=[float(v) for v in box_of(0)], camera="exif"
-    )
+    guessed = cr.register(photo, learned_registrar(), box=BOX, camera="exif")
     assert guessed.translation is not None
 
 
@@ -98,9 +92,7 @@ def test_a_box_that_was_replaced_is_that_of_the_result(folder, monkeypatch):
         "register_prepared",
         lambda *a, **k: [replace(original(*a, **k)[0], corrected_box=fits)],
     )
-    found = cr.register(
-        folder / "photos" / "0.png", learned_registrar(), box=[float(v) for v in box_of(0)]
-    )
+    found = cr.register(folder / "photos" / "0.png", learned_registrar(), box=BOX)
     assert found.box.equal(fits)
 
 

@@ -12,18 +12,17 @@ import torch
 from torch.testing import assert_close
 
 from curvireg_torch.cli import main
-from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import Camera, rotation_error
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.jobs.rigs import BOX, CAMERA, ROTATION, TRANSLATION
-from curvireg_torch.jobs.store import to_json
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as session_module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.workspace import Workspace
-from tests._support import double, learned_registrar
+from tests._support import double, learned_registrar, refused
 from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos, written
 from tests.registration.test_several import WORLD
+from tests.viewer.test_session import document_of
 from tests.viewer.test_workspace import upload
 
 HEADER = ",".join(["photo", *BOX, *CAMERA, *ROTATION, *TRANSLATION])
@@ -86,7 +85,7 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
     files = ["--views", str(folder / "rig.csv"), str(folder / "truck.safetensors")]
     assert main(["register", *files, "--quiet", "--out", str(tmp_path / "result")]) == 0
     written = json.loads((tmp_path / "result" / "result.json").read_text())
-    document = json.loads(to_json(session.document()))
+    document = document_of(session)
     assert rotation_error(double(document["rotation"]), WORLD[:3, :3]) < 1.5
     assert [*document] == [*written, "viewer"]
     for row in written["photographs"]:
@@ -136,7 +135,7 @@ def test_another_answer_and_a_pose_by_hand_are_those_of_all_photographs(found):
     session.shot = first
 
     def check():
-        document = json.loads(to_json(session.document()))
+        document = document_of(session)
         world = double(document["rotation"])
         assert document["rotation"] == first.answer.pose.rotation.tolist()
         for shot, row in zip((first, last), document["photographs"], strict=True):
@@ -177,7 +176,7 @@ def test_boxes_that_are_drawn_replace_those_of_the_rig(found, loose):
     assert rows[1]["box"] != list(last.box_before)
     first.set_box(before)
     session.set_limits(azimuth=(0.0, 90.0))
-    with pytest.raises(InvalidInputError, match="a pose prior: photographs of a rig take none"):
+    with refused("a pose prior: photographs of a rig take none"):
         session.register()
     session.remove_limits()
 

@@ -55,11 +55,13 @@ def run_command(folder, command):
 
 def new_session(*words):
     arguments = parse(["view", *words])
-    return Session(
-        register_options(
-            arguments, *([path] if path else [] for path in (arguments.photo, arguments.mesh))
-        )
-    )
+    files = ([path] if path else [] for path in (arguments.photo, arguments.mesh))
+    return Session(register_options(arguments, *files))
+
+
+def document_of(session):
+    """As it is read again."""
+    return json.loads(to_json(session.document()))
 
 
 @pytest.fixture
@@ -77,7 +79,7 @@ def test_command_gives_the_same_result_bit_by_bit(session, registered):
         f"curvireg register '{folder}/my photo.png' {folder / 'truck.ply'} "
     )
     written = run_command(folder, session.command())
-    document = json.loads(to_json(session.document()))
+    document = document_of(session)
     keys = ("rotation", "translation", "score", "confidence", "covariance", "hypotheses")
     for key in (*keys, "pipeline"):
         assert document[key] == written[key], key
@@ -93,7 +95,7 @@ def test_without_a_box_the_answer_is_a_detection(session, registered):
     session.register()
     for number in (1, 0):
         session.shot.choose(number)
-        document = json.loads(to_json(session.document()))
+        document = document_of(session)
         assert document["detection"]["instances"][0]["rotation"] == document["rotation"]
     assert document["rotation"] != document["hypotheses"][1]["rotation"]
     assert document["rotation"] == run_command(registered[1], session.command())["rotation"]
@@ -104,7 +106,7 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     found = shot.result.registration
     first = session.document()
     shot.choose(1)
-    document = json.loads(to_json(session.document()))
+    document = document_of(session)
     best, second = first["hypotheses"]
     for name in ("rotation", "translation", "score"):
         assert document[name] == second[name]
@@ -149,7 +151,7 @@ def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
     assert rotation_error(pose.rotation, before.rotation) == pytest.approx(6, abs=1e-4)
     shift = pose.rotation @ describer.centre + pose.translation - centre
     assert_close(shift, double([0.05 * describer.radius, 0, 0]))
-    document = json.loads(to_json(session.document()))
+    document = document_of(session)
     assert document["rotation"] == pose.rotation.tolist() == document["hypotheses"][0]["rotation"]
     assert len(document["hypotheses"]) == 2
     unknown = ("confidence", "no_match_probability", "score", "edge_support")
