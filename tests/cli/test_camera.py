@@ -39,6 +39,7 @@ def register_photo(register_one, document, capsys):
     return run
 
 
+@pytest.mark.slow
 def test_guessed_cameras_give_a_translation_whose_covariance_has_the_error_of_the_focal_length(
     register_photo,
 ):

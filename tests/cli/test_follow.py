@@ -220,6 +220,7 @@ def test_frames_of_another_size_scale_the_camera(frames, follow, tmp_path, kind)
     assert "turn the photograph by 90 degrees" in rows[2]["message"]
 
 
+@pytest.mark.slow
 def test_follow_takes_the_exif_data_unasked_and_else_estimates_the_camera(
     frames, follow, tmp_path, capsys
 ):

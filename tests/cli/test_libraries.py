@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 
+@pytest.mark.slow
 def test_libraries_are_loaded_whole_and_their_objects_are_no_longer_searched_for_cycles():
     code = """
 import gc

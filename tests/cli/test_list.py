@@ -106,6 +106,7 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
     assert printed.splitlines()[-1] == f"14 photographs: {verdicts}; see {out}/results.csv"
 
 
+@pytest.mark.slow
 def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch):
     """A mesh that is missing or broken fails only its rows."""
     load = Mock(wraps=ViewBank.load)

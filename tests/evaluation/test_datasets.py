@@ -96,6 +96,7 @@ def test_objects_fail_alone(bop, tmp_path):
     assert summary["failed"] == 3, "and a photograph of one colour"
 
 
+@pytest.mark.slow
 def test_results_are_the_same_bits_on_other_threads_and_agree_resumed(pascal, tmp_path, threads):
     """A run that was resumed registered its photographs in other blocks, which changes rounding."""
     benchmark = Pascal3DBenchmark(pascal, Protocol())

@@ -79,6 +79,7 @@ class TestCompiled:
             assert LayerContract().agrees(graph(x, **options), function(x, **options)), options
 
 
+@pytest.mark.slow
 def test_learnt_values_need_one_graph_for_all_steps():
     torch._dynamo.reset()
     module = filters.ImageGradient(learnable=True)

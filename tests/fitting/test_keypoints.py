@@ -230,6 +230,7 @@ def test_a_pose_needs_enough_keypoints_at_different_places():
     assert _pose(points[[0] * 14], uv[[0] * 14], camera, 2.0, 8) is None
 
 
+@pytest.mark.slow
 def test_origin_of_the_mesh_may_be_far_away(monkeypatch):
     """Behind the camera, and a thousand object radii off."""
     monkeypatch.setattr(keypoints_module, "VIEWS", 24)

@@ -153,6 +153,7 @@ def test_fit_must_find_enough_corners_and_more_than_the_start(
     assert (fit(renderer, image(), turned_can(5.0)) is not None) == counts
 
 
+@pytest.mark.slow
 def test_label_does_not_pull_a_pose_out_of_its_limits(monkeypatch):
     """They are 10 degrees away from the true rotation; no keypoints help."""
     monkeypatch.setattr(cr.Registrar, "keypoint_matches", lambda *_: None)

@@ -353,6 +353,7 @@ def test_page_escapes_names(inspected):
     assert any(line.startswith("size:") for line in report_lines(report))
 
 
+@pytest.mark.slow
 def test_symmetries_of_colours_are_told_from_those_of_shape():
     bands = trimesh.creation.cylinder(0.3, 1.0, sections=24).subdivide().subdivide()
     height = bands.triangles_center[:, 2]

@@ -122,6 +122,7 @@ def test_a_bank_and_a_registrar_have_the_unit_and_the_axis_of_their_mesh(folder,
         cr.register(photo, learned_registrar(), **given)
 
 
+@pytest.mark.slow
 def test_every_copy_is_drawn_and_saved(tmp_path, monkeypatch):
     image, boxes = two_trucks()
     registrar = learned_registrar()

@@ -184,6 +184,7 @@ def _build_all(folder, edges):
     return sum(float(cached_box(Path(folder), edge).descriptors.sum()) for edge in edges)
 
 
+@pytest.mark.slow
 # Spawned processes would import everything again, some seconds each. Python 3.12 warns of fork
 # beside threads.
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")

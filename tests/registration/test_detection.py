@@ -387,6 +387,7 @@ def test_places_of_one_object_leave_room_for_others(monkeypatch):
     assert [one.score for one in found[0]] == [0.6]
 
 
+@pytest.mark.slow
 def test_photographs_are_searched_together_as_alone(registrar, found, monkeypatch):
     """One that cannot be searched fails alone, and each answer is that of its own photograph."""
     monkeypatch.setattr(stages, "BLOCK", {"cpu": 2})

@@ -211,6 +211,7 @@ def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, 
     assert not used or result.confidence == confidence
 
 
+@pytest.mark.slow
 def test_follower_loses_an_absent_object_and_finds_it_again():
     frames = sequence(2)
     known = learned_registrar()

@@ -142,6 +142,7 @@ def test_poses_that_look_alike_are_confirmed_by_the_same_registration(number):
     assert true.confidence > 0.1
 
 
+@pytest.mark.slow
 def test_confidence_never_exceeds_that_of_the_start():
     registrar, (image, _, T) = learned_registrar(), scene(0)
     starts = [None, 0.015, 0.4]

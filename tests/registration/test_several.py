@@ -139,6 +139,7 @@ def test_the_joint_fit_begins_at_each_pose_and_where_a_coarse_fit_moves_it(easy_
     assert not moved.equal(candidates)
 
 
+@pytest.mark.slow
 def test_photographs_that_fail_are_reported_and_change_nothing(easy, tmp_path):
     images, boxes, cameras = rig_of(EASY)
     other, box, T = photograph(60.0, 4, 0.1)
@@ -201,6 +202,7 @@ def test_covariance_shrinks_with_photographs(first, easy):
     assert three.prod() < both.prod()
 
 
+@pytest.mark.slow
 def test_covariance_grows_where_photographs_contradict_each_other(easy):
     """A camera that is turned by a degree moves its picture by 5 px of 100."""
     images, boxes, cameras = rig_of(EASY)
@@ -252,6 +254,7 @@ def test_bad_rigs_name_the_photograph():
         registrar().register_views(images, boxes, None, cameras)
 
 
+@pytest.mark.slow
 def test_copies_of_a_photograph_are_no_evidence():
     images, boxes, cameras = rig_of(IN_DOUBT, noise=0.3)
     once = registered(images[:1], boxes[:1], cameras[:1])
@@ -263,6 +266,7 @@ def test_copies_of_a_photograph_are_no_evidence():
     assert [view.failure for view in thrice.views] == [None, copy, copy]
 
 
+@pytest.mark.slow
 def test_rigs_compare_rivals_that_are_not_reported(easy_and_fits):
     """Of each photograph five, though one is reported."""
     easy, fits = easy_and_fits

@@ -90,6 +90,7 @@ def test_half_turn_that_nothing_in_view_decides_is_named_and_not_reliable(azimut
     assert turn == pytest.approx(180.0, abs=5.0)
 
 
+@pytest.mark.slow
 def test_rig_that_sees_only_what_looks_the_same_names_the_tie():
     registrar = registrar_of(hollow_box())
     images, boxes, poses = zip(
@@ -100,6 +101,7 @@ def test_rig_that_sees_only_what_looks_the_same_names_the_tie():
     assert not result.reliable
 
 
+@pytest.mark.slow
 def test_symmetric_mesh_without_given_symmetries_is_ambiguous():
     box = trimesh.creation.box((200, 120, 80))
     assert registered(registrar_of(box), 40.0, 30.0, 0)[0].ambiguous is None

@@ -17,7 +17,17 @@ from curvireg_torch.geometry.framing import (
 from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.registration.rig import RigPhotograph
 from curvireg_torch.registration.stages import _in_box_of_pose, describe, rank
-from tests._support import CAMERA, SIZE, answer_of, double, errors, eye, learned_registrar, scene
+from tests._support import (
+    CAMERA,
+    SIZE,
+    answer_of,
+    double,
+    errors,
+    eye,
+    learned_registrar,
+    scene,
+    slow_after,
+)
 
 
 def visible_registrar(**changes):
@@ -73,7 +83,7 @@ def test_what_lies_beside_a_visible_box_does_not_count():
         assert is_whole == (block.frames[0] is None) == (count == 2)
 
 
-@pytest.mark.parametrize("seed", [0, 8])
+@pytest.mark.parametrize("seed", slow_after(1, [0, 8]))
 def test_a_hidden_half_needs_a_box_that_is_said_to_be_visible(seed):
     image, box, T = half_hidden(seed)
     result = answer_of(visible_registrar(), image, box)

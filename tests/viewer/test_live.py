@@ -57,6 +57,7 @@ def test_a_frame_is_drawn_once_the_one_before_is_with_a_browser():
     assert page.number == 2
 
 
+@pytest.mark.slow
 def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):
     scenes = sequence(4)
     learned_registrar().bank.save(tmp_path / "truck.safetensors")

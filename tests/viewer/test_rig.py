@@ -210,6 +210,7 @@ def test_a_bad_rig_is_named_with_its_row(workspace, rig, tmp_path, column, value
     assert (workspace.messages, session.shot.view is session.rig["0"]) == ({}, True)
 
 
+@pytest.mark.slow
 def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photographs(
     workspace, rig, tmp_path
 ):

@@ -293,6 +293,7 @@ def test_the_box_of_a_detector_is_on_the_page(folder):
         session.load()
 
 
+@pytest.mark.slow
 def test_distortion_is_removed_from_all_photographs(folder):
     K = torch.tensor([[500.0, 0, 239.5], [0, 500.0, 179.5], [0, 0, 1]])
     session = new_session("photo.png", "truck.ply", "--pipeline", "small.json")  # 240 x 180 px
