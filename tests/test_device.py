@@ -71,6 +71,7 @@ def test_presets_on_a_gpu(preset):
     assert float(torch.linalg.det(found.rotation)) == pytest.approx(1.0, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_registrar_ignores_the_default_dtype():
     image, box, _ = scene(0)
     expected = cr.Registrar(truck_bank())([image], box[None], CAMERA)[0]

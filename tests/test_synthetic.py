@@ -31,6 +31,7 @@ def test_photograph_shows_the_colours_of_the_mesh_at_its_pose_which_must_show_th
         synthesize_photograph(example_mesh(), behind, CAMERA, SIZE, torch.Generator())
 
 
+@pytest.mark.slow
 def test_demo_scenes_depend_on_the_seed_alone():
     first = demo_scene(1).image
     assert torch.equal(first, demo_scene(1).image)

@@ -144,6 +144,7 @@ def test_an_animation_is_no_video(follow, tmp_path, capsys):
     assert "an animation; save it as MP4" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_follow_takes_the_boxes_of_a_detector_by_frame(frames, follow, boxes, tmp_path):
     scenes = frames[1]
     x0, y0, x1, y1 = (

@@ -183,6 +183,7 @@ def test_keypoints_agree_with_the_poses_of_their_object():
     assert matches.agreeing(-T[None]) < 4  # behind the camera
 
 
+@pytest.mark.slow
 def test_keypoints_decide_where_most_of_the_object_is_hidden():
     T = pose(65.0)
     image = photograph(T)

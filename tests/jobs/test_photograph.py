@@ -54,6 +54,7 @@ def test_register_equals_the_command_to_the_last_digit_and_saves_its_files(
     assert saved["rotation"] == document["rotation"]
 
 
+@pytest.mark.slow
 def test_register_takes_pictures_of_other_kinds(folder, result):
     registrar = learned_registrar()
     with Image.open(folder / "photos" / "0.png") as picture:

@@ -74,6 +74,7 @@ def test_a_damaged_file_counts_as_none(tmp_path, damage):
     assert DescribedViews(path).features([1], described)[0].tolist() == [1, 2]
 
 
+@pytest.mark.slow
 def test_matcher_of_a_cached_bank_describes_no_view_twice(tmp_path, monkeypatch):
     pipeline = Pipeline(field="focus", box_jitter=0.0).with_term(
         "appearance", exhaustive_limit=0, top=3

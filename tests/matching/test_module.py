@@ -15,7 +15,7 @@ from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import ImageGradient
 from curvireg_torch.registration import Follower
 from curvireg_torch.terms import Correlation, QueryFeatures
-from tests._support import CAMERA, answer_of, eye, refused, scene, sequence, slow_after, truck_bank
+from tests._support import CAMERA, answer_of, eye, refused, scene, sequence, truck_bank
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +77,8 @@ def _followed(registrar):
     return follow(frames[1][0]).transform
 
 
-@pytest.mark.parametrize(
-    "register", slow_after(2, [_boxed, _followed, _detected, _refined, _together])
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("register", [_boxed, _followed, _detected, _refined, _together])
 def test_registrar_computes_in_full_precision_under_autocast(small_bank, register):
     detection = replace(small_bank.pipeline.detection, proposals=1)
     pipeline = replace(small_bank.pipeline, detection=detection)

@@ -234,6 +234,7 @@ def test_a_start_needs_a_probability(confidence):
         refine(truck_registrar(), [image], CAMERA, [T], start_confidences=[confidence])
 
 
+@pytest.mark.slow
 def test_frames_below_one_half_are_checked_and_a_start_of_no_confidence_is_kept(monkeypatch):
     """What decides is the confidence that is reported: that of the start times the tracker's."""
     frames = sequence(2)

@@ -113,7 +113,8 @@ def test_refine_calls_the_object_lost_below_its_limit(registrar, monkeypatch, co
     assert registrar.refine([image], CAMERA, [T])[0].ok is ok
 
 
-@pytest.mark.parametrize("seed", slow_after(1, [1, 0]))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 0])
 def test_a_half_turn_does_not_become_believed_by_being_refined(seed):
     """The fit alone trusts contours that look alike from behind; all views of the bank, ranked
     again, do not."""

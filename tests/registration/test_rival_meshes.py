@@ -42,7 +42,8 @@ def registered(shown, *banks):
     return answer_of(Registrar(list(banks), pipeline=pipeline), image, box)
 
 
-@pytest.mark.parametrize("order", slow_after(1, [-1, 1]))
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [-1, 1])
 def test_one_shape_in_two_sizes_is_named_and_not_reliable(order):
     result = registered(truck(), *(bank(), bank(scale=1.2))[::order])
     assert not result.reliable

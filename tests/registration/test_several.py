@@ -22,7 +22,6 @@ from tests._support import (
     refused,
     seeded,
     seen_from,
-    slow_after,
 )
 
 EASY = ((100.0, 1), (135.0, 2), (175.0, 3))
@@ -115,8 +114,9 @@ def test_pose_in_the_world_and_in_each_photograph(easy):
     assert len(easy.probabilities) == len(easy.hypotheses) > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("first", "wrong", "degrees"), slow_after(1, [((335.0, 102), 3, 15.0), ((40.0, 104), 2, 3.0)])
+    ("first", "wrong", "degrees"), [((335.0, 102), 3, 15.0), ((40.0, 104), 2, 3.0)]
 )
 def test_half_turns_in_doubt_are_decided_together(monkeypatch, first, wrong, degrees):
     """Views of the two ends differ by half a turn, but not of the same world: only the truth is
@@ -213,6 +213,7 @@ def test_covariance_grows_where_photographs_contradict_each_other(easy):
     assert spread[1] > 2 * spread[0]
 
 
+@pytest.mark.slow
 def test_a_motion_of_the_world_moves_the_answer(easy):
     images, boxes, cameras = rig_of(EASY)
     turn = rotation_from_axis_angle(double([0.4, 2.0, -0.7]))

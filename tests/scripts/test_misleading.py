@@ -136,6 +136,7 @@ def test_wrong_ones_are_counted_among_the_reliable():
     }
 
 
+@pytest.mark.slow
 def test_an_answer_is_wrong_by_its_angle_its_distance_or_its_mesh(small_bank):
     import curvireg_torch as cr
     from curvireg_torch.synthetic import demo_scene
