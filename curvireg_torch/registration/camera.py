@@ -331,7 +331,7 @@ def with_focal_deviation(
 
 
 CLEAR_DEVIATION = 0.2
-CLEAR_BESIDE_PRINTS = 0.15
+CLEAR_WITH_PRINT = 0.15
 """Standard deviations of log f up to which a photograph determines its focal length, without a
 print, and with one, which pulls fits away: with 0.2, two of 61 right answers to photographs with
 prints were named, and of 144 to others none more than with 0.15."""
@@ -379,10 +379,7 @@ def with_checked_cameras(
     some = best[checked]
     given = some.cameras, some.T, some.photograph
     clear = torch.tensor(
-        [
-            CLEAR_BESIDE_PRINTS if block.printed(p) > 0.0 else CLEAR_DEVIATION
-            for p in checked.tolist()
-        ],
+        [CLEAR_WITH_PRINT if block.printed(p) > 0.0 else CLEAR_DEVIATION for p in checked.tolist()],
         dtype=torch.float64,
     )
     gaps, deviations = focal_gaps(target.describer.contours, crops, *given, clear)
@@ -442,9 +439,9 @@ def focal_gaps(
     if not len(noticed):
         return gap, deviation
     log_zoom = coarse.log_zoom[is_far]
-    nearer = scaled_cameras(cameras[noticed], log_zoom)
-    full = ContourProblem.of(contours, crops, nearer, crop_index[noticed])
-    fine = fit_focal_length(full, coarse.state.T[is_far], _no_prior(nearer), FULL_RADII)
+    scaled = scaled_cameras(cameras[noticed], log_zoom)
+    full = ContourProblem.of(contours, crops, scaled, crop_index[noticed])
+    fine = fit_focal_length(full, coarse.state.T[is_far], _no_prior(scaled), FULL_RADII)
     information, _ = focal_information(fine.problem, fine.state, FULL_SIZE_RADII[-1])
     found = (REPORTED_VARIANCE * information.variance).sqrt()
     found = torch.where(found < clear[noticed], found, torch.inf)

@@ -117,8 +117,9 @@ def register_photographs(
     detect: Callable[[Target, Items, int], Results] | None = None,
 ) -> Results:
     """Register photographs in blocks, each to the best of the target and ``others``; one that
-    cannot be registered fails alone. Boxes are corrected, unless ``detect`` searches for the
-    object: in a few photographs, the first of which has an index."""
+    cannot be registered fails alone. They are registered in their boxes, which are corrected, or,
+    with ``detect(target, items, first)``, where that finds the object in a few photographs, the
+    first of which has the index ``first``."""
     results: Results = []
     meshes = (target, *others)
     in_block = detect or _register_block

@@ -101,10 +101,8 @@ def exact_registrar(bank, **options):
 
 def truck_registrar(**changes):
     """A registrar of the truck in exact boxes, with changed fields of its pipeline."""
-    exact = exact_registrar(truck_bank())
-    return (
-        Registrar(truck_bank(), pipeline=replace(exact.pipeline, **changes)) if changes else exact
-    )
+    pipeline = replace(truck_bank().pipeline, **{"box_jitter": 0.0} | changes)
+    return Registrar(truck_bank(), pipeline=pipeline)
 
 
 def bytes_bgr(image):

@@ -120,7 +120,7 @@ def test_register_takes_views_from_the_bank_unless_a_pipeline_file_is_given(
     assert "pose upright, " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("preset", slow_after(1, sorted(PRESETS, reverse=True)))
+@pytest.mark.parametrize("preset", slow_after(2, sorted(PRESETS, reverse=True)))
 def test_register_equals_registrar_bit_by_bit(folder, register_one, document, monkeypatch, preset):
     monkeypatch.setenv("CURVIREG_CACHE", str(folder / "equal"))
     # The views of every preset, thinned out: 12 instead of 7200.

@@ -53,7 +53,9 @@ def test_a_focal_length_that_the_photograph_contradicts_is_named_and_not_reliabl
 
 
 @pytest.mark.parametrize(("keypoints", "clear"), [(0.0, 0.2), (0.1, 0.15)])
-def test_a_focal_length_beside_a_print_has_to_be_clearer(monkeypatch, keypoints, clear):
+def test_the_focal_length_of_an_object_with_a_print_has_to_be_clearer(
+    monkeypatch, keypoints, clear
+):
     image, box = near_photograph()
     given = []
     nothing = torch.zeros(1)
