@@ -11,8 +11,10 @@ from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from .contour_problem import STEPS_PER_ROUND, ContourProblem, ContourState
 from .least_squares import (
     Measurements,
+    PointMatches,
     apply_twist,
     damped_solution,
+    pixels,
     project,
     residual_variance,
     summed_by_cells,
@@ -71,29 +73,39 @@ class FocalFit:
 
 
 def fit_focal_length(
-    problem: ContourProblem, T: Tensor, prior: FocalPrior, radii: Sequence[float]
+    problem: ContourProblem,
+    T: Tensor,
+    prior: FocalPrior,
+    radii: Sequence[float],
+    matches: PointMatches | None = None,
 ) -> FocalFit:
-    """Poses ``T`` (N, 4, 4) and focal lengths whose contours lie on edges:
-    :meth:`ContourProblem.descend` with log f as a seventh unknown. While it changes, the object
-    moves so that its image keeps size and place."""
+    """Poses ``T`` (N, 4, 4) and focal lengths whose contours lie on edges, and whose surface where
+    ``matches`` have it, in px of the problem: :meth:`ContourProblem.descend` with log f as a
+    seventh unknown. While it changes, the object moves so that its image keeps size and place."""
     log_zoom = torch.zeros(len(T), dtype=torch.float64)
     cameras = problem.K
     state = problem.state(T)
     for radius in radii:
-        information, _ = focal_information(problem, state, radius)
+        information, _ = focal_information(problem, state, radius, matches)
         stiffness = information.scale / prior.deviation**2
         for _ in range(STEPS_PER_ROUND):
             uv, J = project(
                 state.points.model, state.points.normals, state.T, problem.K, problem.centre
             )
-            J = torch.cat([J, _by_focal_length(problem, state, uv, J)[..., None]], dim=-1)
+            by_focal = _by_focal_length(problem, state.T, uv, state.points.normals, J)
+            J = torch.cat([J, by_focal], dim=-1)
             gap = prior.log_zoom - log_zoom
             pull = stiffness * (prior.reach / gap.abs().clamp(min=1e-9)).clamp(max=1.0)
             A = torch.zeros(len(T), 7, 7, dtype=torch.float64)
             A[:, 6, 6] = pull
             b = torch.zeros(len(T), 7, 1, dtype=torch.float64)
             b[:, 6, 0] = pull * gap
-            step = problem.selected_step(state.points, uv, J, radius, [(A, b)])
+            others = [(A, b)]
+            if matches is not None:
+                found, _, by_focal = _measured_matches(problem, state.T, matches, radius)
+                found = replace(found, J=torch.cat([found.J, by_focal], dim=-1))
+                others.append(found.equations())
+            step = problem.selected_step(state.points, uv, J, radius, others)
             fraction = problem.step_fraction(step[:, :6], state.T)
             fraction = torch.minimum(fraction, MAX_FOCAL_STEP / step[:, 6].abs().clamp(min=1e-9))
             step = step * fraction.clamp(max=1.0)[:, None]
@@ -134,17 +146,30 @@ def _motion_with_focal_length(T: Tensor, centre: Tensor) -> Tensor:
     return torch.cat([turn, away], dim=1)
 
 
-def _by_focal_length(problem: ContourProblem, state: ContourState, uv: Tensor, J: Tensor) -> Tensor:
-    """(N, P) derivative by log f of the shift of points at ``uv`` (N, P, 2) px along their normals,
-    with the motion of :func:`moved_away`; ``J`` (N, P, 6) is that by the pose."""
-    zoom = ((uv - problem.K[:, None, :2, 2]) * state.points.normals).sum(dim=-1)
-    motion = _motion_with_focal_length(state.T, problem.centre)
-    return zoom + (J @ motion[..., None])[..., 0]
+def _by_focal_length(
+    problem: ContourProblem, T: Tensor, uv: Tensor, normals: Tensor, J: Tensor
+) -> Tensor:
+    """(N, P, 1) derivative by log f of the shift of points at ``uv`` (N, P, 2) px along ``normals``
+    (..., P, 2), with the motion of :func:`moved_away`; ``J`` (N, P, 6) is that by the pose."""
+    zoom = ((uv - problem.K[:, None, :2, 2]) * normals).sum(dim=-1, keepdim=True)
+    motion = _motion_with_focal_length(T, problem.centre)
+    return zoom + J @ motion[..., None]
+
+
+def _measured_matches(
+    problem: ContourProblem, T: Tensor, matches: PointMatches, radius: float
+) -> tuple[Measurements, Tensor, Tensor]:
+    """Matches of C points, with robust weights of the scale ``radius`` px: their measurements along
+    x and y, their pixels (1, 2 C, 2), and the derivatives (1, 2 C, 1) by log f."""
+    measured = matches.measurements(T, problem.K, problem.centre, radius)
+    uv = pixels(matches.model, T, problem.K, problem.centre).repeat_interleave(2, dim=1)
+    axes = torch.eye(2, dtype=torch.float64).repeat(matches.model.shape[1], 1)
+    return measured, uv, _by_focal_length(problem, T, uv, axes, measured.J)
 
 
 @dataclass(frozen=True)
 class FocalInformation:
-    """What edges tell of log f: the ``amount`` (N,) in the units of the normal equations, and the
+    """What measurements tell of log f: the ``amount`` (N,) in the units of the normal equations, and the
     ``scale`` (N,) in px^2, by which one divides it to have the inverse of a variance; and the first
     ``step`` (N,) of log f towards its best value."""
 
@@ -159,14 +184,23 @@ class FocalInformation:
 
 
 def focal_information(
-    problem: ContourProblem, state: ContourState, radius: float
+    problem: ContourProblem,
+    state: ContourState,
+    radius: float,
+    matches: PointMatches | None = None,
 ) -> tuple[FocalInformation, Tensor]:
-    """What edges within ``radius`` px tell of log f beyond what motions of the object could
-    imitate, with errors as in :func:`pose_covariance`; and (N, 6), how the best pose moves with log
+    """What edges within ``radius`` px, and ``matches``, tell of log f beyond what motions of the
+    object could imitate, with errors as in :func:`pose_covariance`; and (N, 6), how the best pose moves with log
     f."""
     measured = problem.measured_edges(state, radius)
     uv, J = project(state.points.model, state.points.normals, state.T, problem.K, problem.centre)
-    by_focal = _by_focal_length(problem, state, uv, J)[..., None]
+    by_focal = _by_focal_length(problem, state.T, uv, state.points.normals, J)
+    if matches is not None:
+        found, at, of_points = _measured_matches(problem, state.T, matches, radius)
+        measured = Measurements.cat_within([measured, found])
+        uv = torch.cat([uv, at], dim=1)
+        J = measured.J
+        by_focal = torch.cat([by_focal, of_points], dim=1)
     W = measured.weight
     imitation = damped_solution(J.mT @ (W * J), J.mT @ (W * by_focal), 1e-6)
     own = by_focal - J @ imitation[..., None]

@@ -43,6 +43,7 @@ CLEAR_MARGIN = 0.1
 # three times as long and find the same poses
 FAR_ROUND = (30, (32.0, 16.0, 8.0, 4.0), 1)
 NEAR_ROUND = (6, (6.0, 4.0, 2.0), 2)
+MATCH_RADIUS = 12  # Search radius in px around a fitted pose whose camera may be wrong
 # Distance in px at which a corner counts a quarter, and inlier ratios that a pose needs after the
 # first round and after the second: patches seen from another side are found less exactly than those
 # of the next frame, and correlate less
@@ -131,6 +132,15 @@ def fit_texture(
     )
 
 
+def texture_matches(
+    draw: Draw, renderer: DepthRenderer, problem: ContourProblem, photograph: Tensor, T: Tensor
+) -> PointMatches | None:
+    """Where a photograph (C, S, S), the crop of a problem of one pose, shows corners of the mesh's
+    colours at a fitted pose ``T`` (1, 4, 4) whose camera may be wrong; None where there are few."""
+    texture = _TextureRounds(draw, renderer, problem, _grey(photograph))
+    return texture.search(T, MATCH_RADIUS, NEAR_ROUND[2])
+
+
 def rotated_starts(fit: ContourFit, centre: Tensor) -> Tensor:
     """(1, 4, 4) or (3, 4, 4): the pose of a fit, then turned both ways about the axis that contours
     do not determine, if there is one."""
@@ -169,7 +179,7 @@ class _TextureRounds:
         """None where the view has few corners, or the photograph few of them."""
         K = self.problem.K
         centre = self.problem.centre
-        matches = self._search(start, radius, samples)
+        matches = self.search(start, radius, samples)
         if matches is None:
             return None
         T = fit_points(matches, start, K, centre, scales)
@@ -182,7 +192,7 @@ class _TextureRounds:
         )
         return _Round(T, matches, before, after)
 
-    def _search(self, T: Tensor, radius: int, samples: int) -> PointMatches | None:
+    def search(self, T: Tensor, radius: int, samples: int) -> PointMatches | None:
         """Corners of the view at a pose and where they are in the photograph; None if there are
         few."""
         problem = self.problem

@@ -20,17 +20,19 @@ from ..fitting.edges import EdgeCrops
 from ..fitting.focal_length import (
     USUAL_DEVIATION,
     USUAL_FOCAL,
+    FocalFit,
     FocalPrior,
     fit_focal_length,
     focal_information,
     moved_away,
     scaled_cameras,
 )
+from ..fitting.least_squares import PointMatches
 from ..fitting.measured_fit import FULL_SIZE_RADII, ContourFit, measured_fit
+from ..fitting.texture_fit import CONVINCING_RATIO, texture_matches
 from ..geometry.cameras import camera_matrix, point_in_cameras, turn_with_ray
 from ..geometry.conversions import cross_matrix
 from ..matching import ViewDescriber
-from ..rendering.contours import MeshContours
 from .block import Block, Limits, least_starts, poses_of_views, with_evidence
 from .confidence import are_near
 from .hypotheses import Hypotheses, best_views, close_rivals, placed, with_short_fit
@@ -331,10 +333,7 @@ def with_focal_deviation(
 
 
 CLEAR_DEVIATION = 0.2
-CLEAR_WITH_PRINT = 0.15
-"""Standard deviations of log f up to which a photograph determines its focal length, without a
-print, and with one, which pulls fits away: with 0.2, two of 61 right answers to photographs with
-prints were named, and of 144 to others none more than with 0.15."""
+"""Standard deviation of log f up to which a photograph determines its focal length."""
 
 CONTRADICTION = 2.0
 """Standard deviations from which a given focal length is named. Those that are stated are more than
@@ -347,8 +346,8 @@ NOTICED_STEP = 0.02
 """First step of log f from which a focal length is fitted: with the right camera most first steps
 are smaller, and a fit takes ten times as long as a step."""
 
-WITHIN_REACH = 2.0
-"""Multiple of the clear deviation up to which, at the fitted pose, a focal length is worth a fit. A
+WITHIN_REACH = 2.0 * CLEAR_DEVIATION
+"""Standard deviation up to which, at the fitted pose, a focal length is worth a fit to contours. A
 fit lowers the deviation, to a third where the given one is 1.3 times the right focal length."""
 
 LARGEST_CHANGE = 2.0
@@ -377,12 +376,8 @@ def with_checked_cameras(
     if not len(checked):
         return found
     some = best[checked]
-    given = some.cameras, some.T, some.photograph
-    clear = torch.tensor(
-        [CLEAR_WITH_PRINT if block.printed(p) > 0.0 else CLEAR_DEVIATION for p in checked.tolist()],
-        dtype=torch.float64,
-    )
-    gaps, deviations = focal_gaps(target.describer.contours, crops, *given, clear)
+    printed = torch.tensor([block.printed(p) > 0.0 for p in checked.tolist()])
+    gaps, deviations = focal_gaps(target.describer, crops, some, printed)
     for place, camera, gap, deviation in zip(
         checked.tolist(), some.cameras, gaps, deviations, strict=True
     ):
@@ -399,22 +394,16 @@ def with_checked_cameras(
 
 
 def focal_gaps(
-    contours: MeshContours,
-    crops: EdgeCrops,
-    cameras: Tensor,
-    T: Tensor,
-    crop_index: Tensor,
-    clear: Tensor,
+    describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses, printed: Tensor
 ) -> tuple[Tensor, Tensor]:
     """How far photographs contradict the focal lengths of fitted poses.
 
     Args:
-        contours: of the mesh.
+        describer: of the mesh.
         crops: of the photographs.
-        cameras: (N, 3, 3) in px of the photographs, N > 0.
-        T: (N, 4, 4) poses, fitted with these cameras.
-        crop_index: (N,) the crop of each pose.
-        clear: (N,) standard deviation of log f up to which each photograph determines it.
+        poses: N > 0 of them.
+        printed: (N,) bool, whether the photograph shows a print of the mesh, by which then focal
+            lengths are fitted as well.
 
     Returns:
         (N,) by how much the log of the focal length that a photograph shows exceeds that of its
@@ -422,31 +411,69 @@ def focal_gaps(
         step or a fit at half the size is small, or the photograph does not determine the focal
         length.
     """
-    gap = torch.zeros(len(T), dtype=torch.float64)
+    gap = torch.zeros(len(poses), dtype=torch.float64)
     deviation = torch.full_like(gap, torch.inf)
-    problem = ContourProblem.of(contours, crops, cameras, crop_index)
-    first, _ = focal_information(problem, problem.state(T), FULL_SIZE_RADII[0])
+    problem = ContourProblem.of(describer.contours, crops, poses.cameras, poses.photograph)
+    first, _ = focal_information(problem, problem.state(poses.T), FULL_SIZE_RADII[0])
     expected = (REPORTED_VARIANCE * first.variance).sqrt()
-    is_worth_it = (first.step.abs() > NOTICED_STEP) & (expected < WITHIN_REACH * clear)
-    noticed = is_worth_it.nonzero()[:, 0]
-    if not len(noticed):
+    noticed = first.step.abs() > NOTICED_STEP
+    by_contours = noticed & (expected < WITHIN_REACH)
+    for row in (noticed & printed).nonzero()[:, 0].tolist():
+        found = _fitted_to_print(describer, crops, poses[row : row + 1])
+        if found is not None:
+            gap[row], deviation[row] = found
+            by_contours[row] = False
+    rows = by_contours.nonzero()[:, 0]
+    if len(rows):
+        found = _fitted_to_contours(describer, crops, poses[rows])
+        gap = gap.index_copy(0, rows, found[0])
+        deviation = deviation.index_copy(0, rows, found[1])
+    return gap, torch.where(deviation < CLEAR_DEVIATION, deviation, torch.inf)
+
+
+def _fitted_to_print(
+    describer: ViewDescriber, crops: EdgeCrops, pose: Hypotheses
+) -> tuple[Tensor, Tensor] | None:
+    """Gap and deviation, see :func:`focal_gaps`, by contours and the print together, of one pose;
+    None where not enough of the print is found."""
+    problem = ContourProblem.of(describer.contours, crops, pose.cameras, pose.photograph)
+    problem = replace(problem, mask=None)
+    photograph = crops.crops[int(pose.photograph)]
+    matches = texture_matches(describer.draw, describer.renderer, problem, photograph, pose.T)
+    if matches is None:
+        return None
+    fit = fit_focal_length(problem, pose.T, _no_prior(pose.cameras), FULL_RADII, matches)
+    ratio = matches.inlier_ratio(fit.state.T, fit.problem.K, problem.centre)
+    if ratio < CONVINCING_RATIO:
+        return None
+    return fit.log_zoom, _deviation(fit, matches)
+
+
+def _fitted_to_contours(
+    describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses
+) -> tuple[Tensor, Tensor]:
+    """Gaps and deviations, see :func:`focal_gaps`, by contours alone."""
+    half = ContourProblem.of(
+        describer.contours, crops, poses.cameras, poses.photograph, factor=2
+    )
+    coarse = fit_focal_length(half, poses.T, _no_prior(poses.cameras), HALF_RADII)
+    gap = coarse.log_zoom
+    deviation = torch.full_like(gap, torch.inf)
+    far = (gap.abs() > 0.5 * SMALLEST_GAP).nonzero()[:, 0]
+    if not len(far):
         return gap, deviation
-    given = cameras[noticed]
-    half = ContourProblem.of(contours, crops, given, crop_index[noticed], factor=2)
-    coarse = fit_focal_length(half, T[noticed], _no_prior(given), HALF_RADII)
-    is_far = coarse.log_zoom.abs() > 0.5 * SMALLEST_GAP
-    noticed = noticed[is_far]
-    if not len(noticed):
-        return gap, deviation
-    log_zoom = coarse.log_zoom[is_far]
-    scaled = scaled_cameras(cameras[noticed], log_zoom)
-    full = ContourProblem.of(contours, crops, scaled, crop_index[noticed])
-    fine = fit_focal_length(full, coarse.state.T[is_far], _no_prior(scaled), FULL_RADII)
-    information, _ = focal_information(fine.problem, fine.state, FULL_SIZE_RADII[-1])
-    found = (REPORTED_VARIANCE * information.variance).sqrt()
-    found = torch.where(found < clear[noticed], found, torch.inf)
-    gap = gap.index_copy(0, noticed, log_zoom + fine.log_zoom)
-    return gap, deviation.index_copy(0, noticed, found)
+    some = poses[far]
+    cameras = scaled_cameras(some.cameras, gap[far])
+    full = ContourProblem.of(describer.contours, crops, cameras, some.photograph)
+    fine = fit_focal_length(full, coarse.state.T[far], _no_prior(cameras), FULL_RADII)
+    gap = gap.index_add(0, far, fine.log_zoom)
+    return gap, deviation.index_copy(0, far, _deviation(fine))
+
+
+def _deviation(fit: FocalFit, matches: PointMatches | None = None) -> Tensor:
+    """(N,) standard deviation of log f."""
+    information, _ = focal_information(fit.problem, fit.state, FULL_SIZE_RADII[-1], matches)
+    return (REPORTED_VARIANCE * information.variance).sqrt()
 
 
 def _no_prior(cameras: Tensor) -> FocalPrior:

@@ -9,8 +9,8 @@ from torch.testing import assert_close
 from curvireg_torch import camera_matrix
 from curvireg_torch.fitting import focal_length
 from curvireg_torch.fitting.contour_problem import ContourProblem
-from curvireg_torch.fitting.edges import EdgeCrops
-from curvireg_torch.fitting.least_squares import apply_twist, project
+from curvireg_torch.fitting.edges import EdgeCrops, EdgeField
+from curvireg_torch.fitting.least_squares import PointMatches, apply_twist, pixels, project
 from curvireg_torch.fitting.measured_fit import FULL_SIZE_RADII
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.geometry.cameras import projected
@@ -80,7 +80,7 @@ def test_derivative_by_the_focal_length():
     numeric = ((pixels(1.0) - pixels(-1.0)) / (2.0 * step) * state.points.normals).sum(dim=-1)
     uv, J = project(state.points.model, state.points.normals, T, problem.K, problem.centre)
     valid = state.points.valid
-    found = focal_length._by_focal_length(problem, state, uv, J)
+    found = focal_length._by_focal_length(problem, T, uv, state.points.normals, J)[..., 0]
     assert_close(found[valid], numeric[valid], atol=1e-4, rtol=1e-4)
     assert found[valid].abs().max() > 1.0
 
@@ -94,6 +94,28 @@ def test_strong_perspective_shows_the_focal_length(wrong):
     assert rotation_error(found.state.T[0, :3, :3], T[0, :3, :3]) < 1.5
     information, _ = focal_length.focal_information(found.problem, found.state, 2.0)
     assert information.variance.sqrt() < 0.2
+
+
+@pytest.mark.parametrize("wrong", [0.75, 1.35])
+def test_points_of_the_surface_show_the_focal_length_without_edges(wrong):
+    problem, T = near_problem(wrong)
+    blank = EdgeField(torch.full((1, 3, 256, 256), 0.5))
+    problem = replace(problem, edges=blank, mask=None)
+    K = focal_length.scaled_cameras(problem.K, -double([wrong]).log())
+    model = problem.state(T).points.model[:, ::10]
+    uv = pixels(model, T, K, problem.centre)
+    matches = PointMatches(model, uv, torch.ones(uv.shape[:2], dtype=torch.float64))
+    start = focal_length.moved_away(T, double([wrong]).log(), problem.centre)
+    none = torch.zeros(1, dtype=torch.float64)
+    prior = focal_length.FocalPrior(none, 1e3, none - 2.0, none + 2.0)
+    found = focal_length.fit_focal_length(problem, start, prior, FULL_SIZE_RADII, matches)
+    assert wrong * float(found.log_zoom.exp()) == pytest.approx(1.0, abs=2e-3)
+    assert rotation_error(found.state.T[0, :3, :3], T[0, :3, :3]) < 0.1
+    exact, _ = focal_length.focal_information(found.problem, found.state, 2.0, matches)
+    assert 0.0 < exact.variance.sqrt() < 0.1
+    assert abs(float(exact.step)) < 2e-3
+    half = focal_length.focal_information(found.problem, found.state, 2.0, matches.scaled(0.5))[0]
+    assert float(half.amount) == pytest.approx(0.5 * float(exact.amount), rel=1e-3)
 
 
 @pytest.mark.parametrize(

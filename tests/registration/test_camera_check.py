@@ -1,14 +1,17 @@
 """Focal lengths that a photograph contradicts."""
 
+import math
 from functools import cache
 
 import pytest
 import torch
 
+from curvireg_torch.fitting.contour_problem import ContourProblem
+from curvireg_torch.fitting.least_squares import PointMatches, pixels
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.registration import camera as camera_module
-from curvireg_torch.registration.block import Block
 from curvireg_torch.registration.camera import focal_contradiction
+from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support import learned_registrar, seeded, seen_from
 
@@ -52,33 +55,57 @@ def test_a_focal_length_that_the_photograph_contradicts_is_named_and_not_reliabl
     assert shown == pytest.approx(FOCAL, rel=0.05)
 
 
-@pytest.mark.parametrize(("keypoints", "clear"), [(0.0, 0.2), (0.1, 0.15)])
-def test_the_focal_length_of_an_object_with_a_print_has_to_be_clearer(
-    monkeypatch, keypoints, clear
-):
-    image, box = near_photograph()
-    given = []
-    nothing = torch.zeros(1)
-    monkeypatch.setattr(Block, "printed", lambda *_: keypoints)
-    monkeypatch.setattr(
-        camera_module, "focal_gaps", lambda *a: given.append(a[-1]) or (nothing, nothing)
-    )
-    learned_registrar()([image], box[None], camera(1.0))
-    assert torch.cat(given).tolist() == [clear]
-
-
-def test_focal_lengths_of_several_photographs_are_compared_at_once():
+def test_focal_lengths_of_several_photographs_are_compared_at_once(monkeypatch):
     given = [registered(factor)[1] for factor in (0.7, 1.0, 1.3)]
-    contours, crops = given[0][:2]
-    each = [torch.cat([one[k] for one in given]) for k in (2, 3, 4, 5)]
-    gaps, deviations = camera_module.focal_gaps(contours, crops, *each)
+    describer, crops = given[0][:2]
+    poses = Hypotheses.cat([one[2] for one in given])
+    printed = torch.cat([one[3] for one in given])
+    gaps, deviations = camera_module.focal_gaps(describer, crops, poses, printed)
     alone = [float(camera_module.focal_gaps(*one)[0]) for one in given]
     assert gaps.tolist() == pytest.approx(alone, abs=1e-5)
     assert gaps.tolist() == pytest.approx([0.357, 0.0, -0.262], abs=0.04)
     assert deviations[1] == torch.inf, "the first step is small: nobody looked further"
     assert float(deviations[0]) < 0.15
-    strict = camera_module.focal_gaps(contours, crops, *each[:3], deviations.clamp(max=1.0))[1]
-    assert strict.isinf().all(), "as clear as that, none is determined"
+    monkeypatch.setattr(camera_module, "CLEAR_DEVIATION", float(deviations[0]))
+    strict = camera_module.focal_gaps(describer, crops, poses, printed)[1]
+    assert strict[0] == torch.inf, "as clear as that, it is not determined"
+
+
+def compared_by_print(monkeypatch, factor, matches):
+    """The gap of :func:`registered` where matches, made by a function of the pixels at which the
+    photograph shows points of the mesh, are found in it; and the gap by contours alone."""
+    describer, crops, pose, _ = registered(factor)[1]
+    truth = seen_from(example_mesh(), 40.0, 25.0, radii=2.6)[None]
+    seen = ContourProblem.of(describer.contours, crops, camera(1.0)[None])
+    model = seen.state(truth).points.model[:, ::20]
+    uv = pixels(model, truth, seen.K, seen.centre)
+    monkeypatch.setattr(camera_module, "texture_matches", lambda *_: matches(model, uv))
+    by_print, by_contours = (
+        camera_module.focal_gaps(describer, crops, pose, torch.tensor([printed]))[0]
+        for printed in (True, False)
+    )
+    return float(by_print), float(by_contours)
+
+
+def as_matches(model, uv):
+    return PointMatches(model, uv, torch.ones(uv.shape[:2], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+def test_a_print_shows_the_focal_length(monkeypatch, factor):
+    monkeypatch.setattr(camera_module, "WITHIN_REACH", 0.0)  # contours tell too little
+    by_print, by_contours = compared_by_print(monkeypatch, factor, as_matches)
+    assert by_print == pytest.approx(-math.log(factor), abs=0.02)
+    assert by_contours == 0.0
+
+
+@pytest.mark.parametrize(
+    "matches",
+    [lambda *_: None, lambda model, uv: as_matches(model, uv + 20.0 * torch.randn_like(uv))],
+)
+def test_a_print_that_is_not_found_is_no_evidence(monkeypatch, matches):
+    by_print, by_contours = compared_by_print(monkeypatch, 1.3, matches)
+    assert by_print == by_contours < -0.2
 
 
 def test_contradictions_need_a_clear_focal_length_two_deviations_and_a_distance_that_matters():
