@@ -169,9 +169,9 @@ def _measured_matches(
 
 @dataclass(frozen=True)
 class FocalInformation:
-    """What measurements tell of log f: the ``amount`` (N,) in the units of the normal equations, and the
-    ``scale`` (N,) in px^2, by which one divides it to have the inverse of a variance; and the first
-    ``step`` (N,) of log f towards its best value."""
+    """What measurements tell of log f: the ``amount`` (N,) in the units of the normal equations,
+    and the ``scale`` (N,) in px^2, by which one divides it to have the inverse of a variance; and
+    the first ``step`` (N,) of log f towards its best value."""
 
     amount: Tensor
     scale: Tensor
@@ -190,8 +190,8 @@ def focal_information(
     matches: PointMatches | None = None,
 ) -> tuple[FocalInformation, Tensor]:
     """What edges within ``radius`` px, and ``matches``, tell of log f beyond what motions of the
-    object could imitate, with errors as in :func:`pose_covariance`; and (N, 6), how the best pose moves with log
-    f."""
+    object could imitate, with errors as in :func:`pose_covariance`; and (N, 6), how the best pose
+    moves with log f."""
     measured = problem.measured_edges(state, radius)
     uv, J = project(state.points.model, state.points.normals, state.T, problem.K, problem.centre)
     by_focal = _by_focal_length(problem, state.T, uv, state.points.normals, J)

@@ -453,9 +453,7 @@ def _fitted_to_contours(
     describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses
 ) -> tuple[Tensor, Tensor]:
     """Gaps and deviations, see :func:`focal_gaps`, by contours alone."""
-    half = ContourProblem.of(
-        describer.contours, crops, poses.cameras, poses.photograph, factor=2
-    )
+    half = ContourProblem.of(describer.contours, crops, poses.cameras, poses.photograph, factor=2)
     coarse = fit_focal_length(half, poses.T, _no_prior(poses.cameras), HALF_RADII)
     gap = coarse.log_zoom
     deviation = torch.full_like(gap, torch.inf)
