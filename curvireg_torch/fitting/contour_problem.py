@@ -30,6 +30,9 @@ SELECTIONS_PER_STEP = 3
 STALE_SHIFT = 0.6
 """Mean shift of the contour points in px after which the mesh's contours are found again."""
 
+NEAR = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
+"""Offsets in px at which edges support a contour point."""
+
 NO_EDGE = 1e-30
 """Strength below which there is no edge."""
 
@@ -155,12 +158,14 @@ class ContourProblem(Rows):
         J = J.to(distance.dtype)
         if self.mask is not None:
             strength = strength * self.mask.weights(
-                uv, points, _offsets(radius, uv.device)[1:-1], self.image_index, self.size
+                uv, points, _offsets(radius)[1:-1], self.image_index, self.size
             )
         # The logarithm of 0 takes ten times as long as that of other numbers.
         log = strength.clamp(min=NO_EDGE).log()
         residual = distance
-        for _ in range(SELECTIONS_PER_STEP):
+        for selection in range(SELECTIONS_PER_STEP):
+            if selection:
+                residual = distance - J @ step[..., None].to(J.dtype)
             # The largest strength times exp(-2 (residual / radius)^2)
             agreement = torch.addcmul(log, residual, residual, value=-2.0 / radius**2)
             index = agreement.max(dim=-1, keepdim=True).indices  # faster than argmax
@@ -171,7 +176,6 @@ class ContourProblem(Rows):
                 A = A + more_A
                 b = b + more_b
             step = self.solution(A, b)
-            residual = distance - J @ step[..., None].to(J.dtype)
         return step
 
     def solution(self, A: Tensor, b: Tensor) -> Tensor:
@@ -187,7 +191,7 @@ class ContourProblem(Rows):
     ) -> tuple[Tensor, Tensor]:
         """Distances in px along the normals and strengths, both (N, P, L) float32, enough for a
         step; the strength is 0 where there is no edge."""
-        offsets = _offsets(radius, uv.device)
+        offsets = _offsets(radius)
         profile = self.edges.strength(uv, points.normals, offsets, self.image_index)
         before = profile[..., :-2]
         here = profile[..., 1:-1]
@@ -196,7 +200,8 @@ class ContourProblem(Rows):
         curvature = (before - 2.0 * here + behind).clamp(max=-1e-9)
         # of the parabola through the three values
         vertex = (0.5 * (before - behind) / curvature).clamp(-0.5, 0.5)
-        return offsets[1:-1] + vertex, torch.where(is_peak, here, 0.0)
+        middle = torch.tensor(offsets[1:-1], device=uv.device)
+        return middle + vertex, torch.where(is_peak, here, 0.0)
 
     def edge_support(self, state: ContourState) -> Tensor:
         """(N,) mean strength of the edges within about 1 px of the contour points."""
@@ -208,11 +213,11 @@ class ContourProblem(Rows):
         points = state.points
         uv = pixels(points.model, state.T, self.K, self.centre)
         counts = self.edges.counts(uv, points.valid, self.image_index)
-        offsets, near = self._near(uv, points.normals)
+        near = self._near(uv, points.normals)
         plain = (near.amax(dim=-1).double() * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1)
         if self.mask is None:
             return plain, plain
-        near = near * self.mask.weights(uv, points, offsets, self.image_index, self.size)
+        near = near * self.mask.weights(uv, points, NEAR, self.image_index, self.size)
         most = self.mask.largest_weights(points) * counts  # a long outline alone is no support
         return plain, (near.amax(dim=-1).double() * counts).sum(dim=1) / most.sum(dim=1).clamp(
             min=1
@@ -221,15 +226,13 @@ class ContourProblem(Rows):
     def strength_near(self, uv: Tensor, normals: Tensor) -> Tensor:
         """(N, P) float64 strength of the edges within about 1 px of points (N, P, 2) px with
         ``normals`` (N, P, 2)."""
-        _, near = self._near(uv, normals)
-        return near.amax(dim=-1).double()
+        return self._near(uv, normals).amax(dim=-1).double()
 
-    def _near(self, uv: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets (L,) px along the normals, and the strengths (N, P, L) there, which fall with the
-        distance from the point."""
-        offsets = torch.arange(-3, 4, dtype=torch.float32, device=uv.device)
-        strength = self.edges.strength(uv, normals, offsets, self.image_index)
-        return offsets, strength * torch.exp(-0.5 * offsets**2)
+    def _near(self, uv: Tensor, normals: Tensor) -> Tensor:
+        """(N, P, 7) strengths at ``NEAR`` px along the normals, which fall with the distance from
+        the point."""
+        strength = self.edges.strength(uv, normals, NEAR, self.image_index)
+        return strength * torch.exp(-0.5 * torch.tensor(NEAR, device=uv.device) ** 2)
 
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:
         """The edges that a least-squares step without a mask would use."""
@@ -242,7 +245,7 @@ class ContourProblem(Rows):
         return Measurements(J, d, W)
 
 
-def _offsets(radius: float, device: torch.device) -> Tensor:
+def _offsets(radius: float) -> tuple[float, ...]:
     """Offsets in px at which edges are searched within ``radius`` of a predicted position."""
     far = round(1.5 * radius) + 1
-    return torch.arange(-far, far + 1, dtype=torch.float32, device=device)
+    return tuple(float(offset) for offset in range(-far, far + 1))

@@ -1,6 +1,7 @@
 """Edges of photographs around objects, and how far an object's mask agrees with them."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -44,7 +45,9 @@ class EdgeField:
         area = self._inside.sum(dim=(1, 2, 3))
         self._level = (energy / area.clamp(min=1)).sqrt().clamp(min=1e-6)
 
-    def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, image_index: Tensor) -> Tensor:
+    def strength(
+        self, uv: Tensor, normals: Tensor, offsets: tuple[float, ...], image_index: Tensor
+    ) -> Tensor:
         """Strength of the image gradient across a contour, at offsets along its normals.
 
         With g the gradient, m the crop's root mean square gradient and c = ``|n . g| / |g|``, r =
@@ -52,8 +55,8 @@ class EdgeField:
         where n and g differ by 33 degrees.
 
         Args:
-            uv, normals: (N, P, 2) pixels of the crops and unit vectors.
-            offsets: (L,) px along the normals.
+            uv, normals: (N, P, 2) float64 pixels of the crops and unit vectors.
+            offsets: L of them, px along the normals.
             image_index: (N,) the crop of each pose.
 
         Returns:
@@ -88,7 +91,12 @@ class ObjectMask:
         self._pictures = _Pictures(self.probability, "replicate")
 
     def weights(
-        self, uv: Tensor, points: ContourPoints, offsets: Tensor, image_index: Tensor, size: int
+        self,
+        uv: Tensor,
+        points: ContourPoints,
+        offsets: tuple[float, ...],
+        image_index: Tensor,
+        size: int,
     ) -> Tensor:
         """How well edges at offsets along the normals of contour points agree with the mask.
 
@@ -97,15 +105,15 @@ class ObjectMask:
         min(p, q).
 
         Args:
-            uv: (N, P, 2) px of the points in crops of ``size`` px.
-            offsets: (L,) px along the normals.
+            uv: (N, P, 2) float64 px of the points in crops of ``size`` px.
+            offsets: L of them, px along the normals.
             image_index: (N,) the crop of each pose.
 
         Returns:
             (N, P, L) float32, at most 2.
         """
         aside = MASK_DISTANCE * size
-        at = torch.cat([offsets - aside, offsets + aside])
+        at = tuple(offset + side for side in (-aside, aside) for offset in offsets)
         probability = self._pictures.along(uv, points.normals, at, image_index, size)
         inside, outside = probability[0].chunk(2, dim=-1)
         outline = (inside - outside).clamp(min=0.0)
@@ -135,26 +143,26 @@ class _Pictures:
         self.joined = below.contiguous(memory_format=torch.channels_last)
 
     def along(
-        self, uv: Tensor, normals: Tensor, offsets: Tensor, image_index: Tensor, size: int
+        self,
+        uv: Tensor,
+        normals: Tensor,
+        offsets: tuple[float, ...],
+        image_index: Tensor,
+        size: int,
     ) -> Tensor:
-        """(C, N, P, L) float32 values at offsets (L,) px from points (N, P, 2) along normals, in
+        """(C, N, P, L) float32 values at L offsets in px from points (N, P, 2) along normals, in
         the pictures ``image_index`` (N,); points and offsets refer to a side of ``size`` px."""
         N, P, _ = uv.shape
         L = len(offsets)
         height, width = self.joined.shape[2:]
-        # from px of the crop to the units of grid_sample, in which a picture's sides are 2
-        unit = uv.new_tensor([2.0 / width, 2.0 / height])
-        scale = unit * (self.side / size)
-        start = torch.addcmul(0.5 * scale + unit - 1.0, uv, scale)
+        scale, shift, steps = _sampling(offsets, width, height, self.side / size, uv.device)
+        start = torch.addcmul(shift, uv, scale)
         has_several = height > width
         if has_several:
             first_row = image_index[:, None] * (width * 2.0 / height)
             start[..., 1] += first_row
         # A matrix product is four times as fast as start + offset x normal with its short rows.
         lines = torch.cat([start, scale * normals], dim=-1).float()
-        steps = torch.stack([torch.ones_like(offsets), offsets]).float()
-        axes = torch.eye(2, dtype=torch.float32, device=offsets.device)
-        steps = (steps[:, None, :, None] * axes[:, None]).view(4, 2 * L)
         grid = (lines.flatten(0, 1) @ steps).view(N, P * L, 2)
         if has_several:
             lowest = (first_row + (1.0 / height - 1.0)).float()
@@ -164,6 +172,22 @@ class _Pictures:
             self.joined, grid.view(1, N * P, L, 2), padding_mode="border", align_corners=False
         )
         return sampled.view(-1, N, P, L)
+
+
+@lru_cache(maxsize=256)
+def _sampling(
+    offsets: tuple[float, ...], width: int, height: int, ratio: float, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
+    """From px, ``ratio`` of which are one of a picture, to the units of grid_sample, in which the
+    sides of a picture are 2: (2,) the scale and the shift of points; and the (4, 2 L) matrix that
+    takes the scaled x and y of a point and its normal to places at L offsets."""
+    unit = torch.tensor([2.0 / width, 2.0 / height], dtype=torch.float64, device=device)
+    scale = ratio * unit
+    along = torch.tensor(offsets, dtype=torch.float32, device=device)
+    steps = torch.stack([torch.ones_like(along), along])
+    axes = torch.eye(2, dtype=torch.float32, device=device)
+    steps = (steps[:, None, :, None] * axes[:, None]).view(4, -1)
+    return scale, 0.5 * scale + unit - 1.0, steps
 
 
 class EdgeCrops:

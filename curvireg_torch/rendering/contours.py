@@ -3,6 +3,7 @@ picture; on a CPU and on other devices."""
 
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -147,6 +148,7 @@ class _Level:
         self.ends = self._tensor(edges.edges[:, 1], torch.long).contiguous()
         self.normals = self._tensor(edges.normals, torch.float32)
         self.creases = self._tensor(edges.is_crease.nonzero()[0], torch.long)
+        self.listed = torch.cat([torch.arange(len(self.starts), device=device), self.creases])
         self.is_smooth = self._tensor(edges.is_smooth, torch.bool)
         self.side_planes = self._tensor(edges.side_planes(), torch.float64)
         self.visibility = _visibility(edges.vertices / radius, edges.faces, device)
@@ -164,16 +166,35 @@ def _visibility(
 
 
 @dataclass(frozen=True)
-class _Places:
+class _Places(Rows):
     """Places (N, M) on edges of N views: the edge, the fraction of its length, the point (N, M, 3)
     in the camera's frame, and the unit normal (N, M, 2) across the edge in the image; False in
-    ``valid`` (N, M) where a view has no edges."""
+    ``valid`` (N, M) where a view has no such edges."""
 
     edge: Tensor
     fraction: Tensor
     at: Tensor
     normal: Tensor
     valid: Tensor
+
+
+class _Columns:
+    """M columns of a table of views: first those on occluding contours, of kind 0, then those on
+    creases, of kind 1. ``each`` (2,) tells how many there are of each kind, ``kind`` (M,) the kind
+    of each column, ``place`` (M,) its number within the kind, of ``of_kind`` (M,)."""
+
+    def __init__(self, occluding: int, creases: int, device: torch.device) -> None:
+        self.occluding = occluding
+        self.each = torch.tensor([occluding, creases], device=device)
+        self.kind = torch.arange(2, device=device).repeat_interleave(self.each)
+        self.place = torch.arange(len(self.kind), device=device) - occluding * self.kind
+        self.of_kind = self.each[self.kind]
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+
+_columns = lru_cache(maxsize=16)(_Columns)
 
 
 class _Views:
@@ -212,37 +233,39 @@ class _Views:
 
     def points(self, density: float) -> ContourPoints:
         """The points on occluding contours, then those on creases."""
-        occluding = self._on_occluding_contours(density)
-        creases = self._on_creases(density)
-        return ContourPoints.cat_within([occluding, creases])
+        device = self.level.device
+        candidates, chosen = (
+            _columns(round(density * occluding), round(density * creases), device)
+            for occluding, creases in (
+                (OCCLUDING_CANDIDATES, CREASE_CANDIDATES),
+                (MAX_OCCLUDING, MAX_CREASES),
+            )
+        )
+        on_crease = candidates.kind > 0
+        places = self._smoothed(self._spread(candidates), ~on_crease)
+        aside = torch.where(on_crease, 0.0, ASIDE)[:, None]
+        rays = _rays_to(places.at) + (aside / self.focal_lengths) * places.normal
+        depth = self.depth_of(rays, None)
+        behind = depth - places.at[..., 2]
+        least = torch.where(on_crease, -VISIBLE_TOLERANCE, OCCLUSION_JUMP)
+        is_seen = places.valid & (behind > least)
+        first = candidates.occluding
+        self._keep_folds(places[:, first:], rays[:, first:], is_seen[:, first:])
+        return self._chosen(places, is_seen, depth.isinf() & ~on_crease, candidates, chosen)
 
-    def _on_occluding_contours(self, density: float) -> ContourPoints:
-        pose, edge = self.on_contour.nonzero().unbind(1)
-        places = self._spread(pose, edge, round(density * OCCLUDING_CANDIDATES))
-        places = self._smoothed(places)
-        outside = _rays_to(places.at) + (ASIDE / self.focal_lengths) * places.normal
-        depth = self.depth_of(outside, None)
-        is_seen = places.valid & (depth - places.at[..., 2] > OCCLUSION_JUMP)
-        return self._chosen(places, is_seen, depth.isinf(), round(density * MAX_OCCLUDING))
-
-    def _on_creases(self, density: float) -> ContourPoints:
-        creases = self.level.creases
-        pose, number = (~self.on_contour.index_select(1, creases)).nonzero().unbind(1)
-        edge = _taken(creases, number)
-        places = self._spread(pose, edge, round(density * CREASE_CANDIDATES))
-        is_fold = self._is_fold(places)
-        no_outline = torch.zeros_like(is_fold)
-        return self._chosen(places, is_fold, no_outline, round(density * MAX_CREASES))
-
-    def _spread(self, pose: Tensor, edge: Tensor, count: int) -> _Places:
-        """``count`` places in each view, evenly along its edges (M,), whose poses (M,) ascend."""
+    def _spread(self, columns: _Columns) -> _Places:
+        """Places in each view, evenly along its occluding contours and along its creases."""
+        level = self.level
         N, V, _ = self.vertices.shape
-        has_edges = len(edge) > 0
+        is_crease = ~self.on_contour.index_select(1, level.creases)
+        pose, number = torch.cat([self.on_contour, is_crease], dim=1).nonzero().unbind(1)
+        has_edges = len(pose) > 0
         if not has_edges:
-            pose = edge = edge.new_zeros(1)
+            pose = number = pose.new_zeros(1)
+        edge = level.listed.index_select(0, number)
         vertices_before = V * pose
-        start = self.level.starts.index_select(0, edge) + vertices_before
-        end = self.level.ends.index_select(0, edge) + vertices_before
+        start = level.starts.index_select(0, edge) + vertices_before
+        end = level.ends.index_select(0, edge) + vertices_before
         along = self.pixels.index_select(0, end) - self.pixels.index_select(0, start)
         span = along.abs()
         beyond_start = self.beyond.index_select(0, start)
@@ -250,20 +273,23 @@ class _Views:
         # Outside are edges whose ends share a bit, and those that reach behind the camera.
         outside = (beyond_start & beyond_end) | ((beyond_start | beyond_end) & BEHIND)
         length = span.masked_fill(outside != 0, 0.0).nan_to_num_(0.0, posinf=0.0)
-        number, fraction, valid = _spread_evenly(length * has_edges, pose, N, count)
-        chosen = edge.index_select(0, number).view(N, count)
+        chain = 2 * pose + (number >= len(level.starts))
+        taken, fraction, valid = _spread_evenly(length * has_edges, chain, N, columns)
+        size = (N, len(columns))
+        chosen = edge.index_select(0, taken).view(size)
         vertices = self.vertices.flatten(0, 1)
-        first = vertices.index_select(0, start.index_select(0, number)).view(N, count, 3)
-        second = vertices.index_select(0, end.index_select(0, number)).view(N, count, 3)
+        first = vertices.index_select(0, start.index_select(0, taken)).view(*size, 3)
+        second = vertices.index_select(0, end.index_select(0, taken)).view(*size, 3)
         at = torch.lerp(first, second, fraction[..., None])
         # across the edge, to the side on which its faces are not
         unit = along / span.clamp(min=1e-30)
         turn = torch.where(self.side.gather(1, chosen), -1j, 1j).to(unit.dtype)
-        normal = torch.view_as_real(turn * unit.index_select(0, number).view(N, count))
+        normal = torch.view_as_real(turn * unit.index_select(0, taken).view(size))
         return _Places(chosen, fraction, at, normal, valid)
 
-    def _smoothed(self, places: _Places) -> _Places:
-        """Places whose normals are those of the smooth surface, where the mesh stands for one."""
+    def _smoothed(self, places: _Places, occluding: Tensor) -> _Places:
+        """Places (N, M) of which those that are ``occluding`` (M,) have the normals of the smooth
+        surface, where the mesh stands for one."""
         level = self.level
         start = _taken(level.normals, _taken(level.starts, places.edge))
         end = _taken(level.normals, _taken(level.ends, places.edge))
@@ -271,16 +297,15 @@ class _Views:
         smooth = (surface_normal @ self.rotation[:, :2].mT) / self.focal_lengths
         smooth = F.normalize(smooth, dim=-1, eps=1e-30)
         cosine = (smooth * places.normal).sum(dim=-1, keepdim=True)
-        agrees = _taken(level.is_smooth, places.edge)[..., None] & (cosine.abs() > 0.5)
+        is_smooth = _taken(level.is_smooth, places.edge) & occluding
+        agrees = is_smooth[..., None] & (cosine.abs() > 0.5)
         normal = torch.where(agrees, cosine.sign() * smooth, places.normal)
         return replace(places, normal=normal)
 
-    def _is_fold(self, places: _Places) -> Tensor:
-        """(N, M) bool: which places are not hidden, and fold the surface at the scale of the
-        crop."""
+    def _keep_folds(self, places: _Places, rays: Tensor, is_seen: Tensor) -> None:
+        """Mark places (N, M) on creases as not seen, to which ``rays`` (N, M, 2) lead, where the
+        surface is not folded at the scale of the crop."""
         z = places.at[..., 2]
-        rays = _rays_to(places.at)
-        is_seen = places.valid & (self.depth_of(rays, places.valid) > z - VISIBLE_TOLERANCE)
         step = CREASE_SCALE * self.size
         aside = (step / self.focal_lengths) * places.normal
         on_both_sides = torch.cat([rays + aside, rays - aside], dim=1)
@@ -288,13 +313,19 @@ class _Views:
         ahead, back = depth.chunk(2, dim=1)
         bend = (ahead - 2.0 * z + back).abs() * (self.focal_lengths[..., 0] / step) / z
         largest_jump = torch.maximum((ahead - z).abs(), (back - z).abs())
-        return is_seen & (bend > CREASE_BEND) & (largest_jump < 2.0 * OCCLUSION_JUMP)
+        is_seen &= (bend > CREASE_BEND) & (largest_jump < 2.0 * OCCLUSION_JUMP)
 
     def _chosen(
-        self, places: _Places, is_seen: Tensor, is_outline: Tensor, most: int
+        self,
+        places: _Places,
+        is_seen: Tensor,
+        is_outline: Tensor,
+        candidates: _Columns,
+        chosen: _Columns,
     ) -> ContourPoints:
-        """At most ``most`` of the places of each view that are seen."""
-        index, is_point = _evenly_chosen(is_seen, most)
+        """Of the places that are seen, columns of ``candidates``, the ``chosen`` number of each
+        kind."""
+        index, is_point = _evenly_chosen(is_seen, candidates, chosen)
         from_centre = (_taken(places.at.flatten(0, 1), index) - self.position).double() @ self.R
         model = torch.add(self.centre, from_centre, alpha=self.level.radius)
         normals = _taken(places.normal.flatten(0, 1), index).double()
@@ -314,44 +345,50 @@ def _rays_to(at: Tensor) -> Tensor:
 
 
 def _spread_evenly(
-    length: Tensor, pose: Tensor, poses: int, count: int
+    length: Tensor, chain: Tensor, views: int, columns: _Columns
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """``count`` places for each of N ``poses``, evenly along its edges of lengths (M,); ``pose``
-    (M,) are the edges' poses, ascending. Returns the numbers (N * count,) of the edges, and, (N,
-    count), the fractions of their lengths, and whether there are edges."""
+    """Places in the ``columns`` of N ``views``, evenly along chains of edges of lengths (E,).
+    ``chain`` (E,) is twice the view of an edge plus its kind, and ascends. Returns the numbers (N *
+    M,) of the edges, and, (N, M), the fractions of their lengths, and whether there are edges."""
     # in whole units, whose sums are exact: places of a pose do not depend on the other poses
     length = (LENGTH_UNITS * length.double()).round()
     end = length.cumsum(dim=0)
-    border = torch.searchsorted(pose, torch.arange(poses + 1, device=pose.device))
+    border = torch.searchsorted(chain, torch.arange(2 * views + 1, device=chain.device))
     before = F.pad(end, (1, 0))[border]
     total = before.diff()
-    has_edges = total > 0
-    # Place k lies at (k + 1/2) / count of a pose's length: the number of places up to each edge's
-    # end, in all poses
-    rate = torch.where(has_edges, count / total, 0.0)
+    count = columns.each.repeat(views)
+    # Place k lies at (k + 1/2) / count of a chain's length: the number of places up to each edge's
+    # end, in all chains
+    rate = torch.where(total > 0, count / total, 0.0)
+    earlier = count.cumsum(dim=0) - count
     passed = (
-        (end - before.index_select(0, pose)) * rate.index_select(0, pose) + 0.5
-    ).long() + count * pose
-    passed[-1] = count * poses
+        (end - before.index_select(0, chain)) * rate.index_select(0, chain) + 0.5
+    ).long() + earlier.index_select(0, chain)
+    size = (views, len(columns))
+    passed[-1] = views * len(columns)
     places = torch.diff(passed, prepend=passed.new_zeros(1))
-    number = torch.repeat_interleave(places, output_size=count * poses)
-    place = (torch.arange(count, dtype=torch.float32, device=pose.device) + 0.5) / count
-    target = before[:-1, None] + place * total[:, None]
-    behind = end.index_select(0, number).view(poses, count) - target
-    length_there = length.index_select(0, number).view(poses, count)
+    number = torch.repeat_interleave(places, output_size=views * len(columns))
+    first = before[:-1].view(views, 2).index_select(1, columns.kind)
+    whole = total.view(views, 2).index_select(1, columns.kind)
+    target = first + (columns.place.float() + 0.5) / columns.of_kind * whole
+    behind = end.index_select(0, number).view(size) - target
+    length_there = length.index_select(0, number).view(size)
     fraction = 1.0 - behind / length_there.clamp(min=1e-30)
-    return number, fraction.clamp(0.0, 1.0).float(), has_edges[:, None].expand(poses, count)
+    return number, fraction.clamp(0.0, 1.0).float(), whole > 0
 
 
-def _evenly_chosen(valid: Tensor, most: int) -> tuple[Tensor, Tensor]:
-    """Indices (N, most) into the flat (N * M,) of valid entries (N, M), evenly chosen in each row
-    that has more, and which are not padding."""
-    count = valid.sum(dim=1, keepdim=True)
-    place = torch.arange(most, device=valid.device)
-    rank = torch.where(count > most, place * count // most, place)
-    is_point = place < count
+def _evenly_chosen(
+    valid: Tensor, candidates: _Columns, chosen: _Columns
+) -> tuple[Tensor, Tensor]:
+    """Indices (N, M) into the flat (N * L,) of valid entries (N, L), ``candidates`` of each kind:
+    the ``chosen`` number of it, evenly where there are more; and which are not padding."""
+    by_kind = valid.split(candidates.each.tolist(), dim=1)
+    count = torch.stack([of_kind.sum(dim=1) for of_kind in by_kind], dim=1)
+    first = (count.flatten().cumsum(dim=0).view_as(count) - count).index_select(1, chosen.kind)
+    count = count.index_select(1, chosen.kind)
+    rank = torch.where(count > chosen.of_kind, chosen.place * count // chosen.of_kind, chosen.place)
+    is_point = chosen.place < count
     entry = F.pad(valid.flatten().nonzero()[:, 0], (0, 1))
-    first = count.cumsum(dim=0) - count
     index = _taken(entry, torch.where(is_point, first + rank, 0))
     padding = valid.shape[1] * torch.arange(len(valid), device=valid.device)[:, None]
     return torch.where(is_point, index, padding), is_point

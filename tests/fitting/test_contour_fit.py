@@ -26,6 +26,7 @@ from tests.fitting.cube import BOX, CUBE_POSE, K, cube, cube_crops, fitted, nois
 
 CENTRE = double([0.2, -0.1, 0.3])
 T = pose([0.3, -0.5, 0.2], [0.1, 0.2, 6.0])[None]
+HERE = (0.0,)
 FIRST = torch.tensor([0])
 
 
@@ -38,7 +39,7 @@ class ParabolicEdges:
         self.heights = double(heights)
 
     def strength(self, uv, normals, offsets, image_index):
-        apart = (offsets - self.distances[:, :, None]) / 1.5
+        apart = (torch.tensor(offsets) - self.distances[:, :, None]) / 1.5
         return (self.heights[:, None, None] * (1.0 - apart**2).clamp(min=0.0)).sum(dim=0)[None]
 
     def counts(self, uv, valid, image_index):
@@ -116,7 +117,7 @@ def test_edge_strength_peaks_on_a_slanted_edge():
     image = torch.sigmoid(4 * (0.8 * x + 0.6 * y - 44.0))[None, None]
     here = double([[[32.0, 31.0]]])  # 0.2 px from the edge
     edges = EdgeField(image)
-    offsets = torch.arange(-5, 6, dtype=torch.float64)
+    offsets = tuple(range(-5, 6))
     across = edges.strength(here, n, offsets, FIRST)[0, 0]
     assert int(across.argmax()) == 5
     assert float(across[0]) < 0.1 * float(across[5])
@@ -132,7 +133,7 @@ def test_edge_strength_falls_with_the_fifth_power_of_the_cosine_in_the_strongest
     angles = math.atan2(0.6, 0.8) + double([0.0, 0.3, -0.6, 1.0, math.pi / 2, math.pi])
     n = torch.stack([angles.cos(), angles.sin()], dim=-1)[None]
     here = double([31.5, 30.2]).expand(1, 6, 2)
-    strength = EdgeField(ramp[None]).strength(here, n, torch.zeros(1), FIRST)[0, :, 0].double()
+    strength = EdgeField(ramp[None]).strength(here, n, HERE, FIRST)[0, :, 0].double()
     r = strength / (1.0 - strength)  # in units of the crop's root mean square gradient
     cosine = (angles - angles[0]).cos().abs()
     assert_close(r / r[0], cosine**5, rtol=1e-3, atol=1e-4)
@@ -146,11 +147,7 @@ def test_edges_outside_the_photograph_do_not_count():
     uv = double([[[10.0, 20.0], [12.0, 40.0], [50.0, 20.0]]])
     n = double([1.0, 0.0]).expand(1, 3, 2)
     valid = torch.ones(1, 3, dtype=torch.bool)
-    assert (edges.strength(uv, n, torch.zeros(1).double(), FIRST)[0, :, 0] > 0).tolist() == [
-        True,
-        True,
-        False,
-    ]
+    assert (edges.strength(uv, n, HERE, FIRST)[0, :, 0] > 0).tolist() == [True, True, False]
     assert edges.counts(uv, valid, FIRST).tolist() == [[True, True, False]]
     # with less than half of the points inside, all count
     few = uv.index_fill(1, torch.tensor([1]), 50.0)
@@ -180,7 +177,7 @@ def row_of_points(outline, direction, *, count=1):
 def test_mask_weights_within_at_the_border_and_beyond_in_the_crop_of_each_pose():
     """At 20 px to the left of the border, on it, and at 20 px to the right."""
     uv = double([[[127.5, 90.0]]])
-    offsets = double([-20.0, 0.0, 20.0])
+    offsets = (-20.0, 0.0, 20.0)
     # at the second the object lies outside
     outlines = (True, 1.0, [0.6, 2.0, 0.6]), (True, -1.0, [0.6, 0.6, 0.6])
     for outline, direction, expected in (
@@ -195,11 +192,10 @@ def test_mask_weights_within_at_the_border_and_beyond_in_the_crop_of_each_pose()
     # Borders at 128 and 64 of 256 px are at 64 and 32 of 128 px; the mask is read 3 px to both
     # sides there.
     uv = double([[[31.5, 50.0]], [[63.5, 50.0]], [[31.5, 50.0]]])
-    here = torch.zeros(1, dtype=torch.float64)
     index = torch.tensor([0, 0, 1])
-    found = half_planes(128, 64).weights(uv, row_of_points(True, 1.0, count=3), here, index, 128)
+    found = half_planes(128, 64).weights(uv, row_of_points(True, 1.0, count=3), HERE, index, 128)
     assert found.flatten().tolist() == pytest.approx([0.6, 2.0, 2.0])
-    off = double([-2.4, 2.4, -3.6, 3.6])
+    off = (-2.4, 2.4, -3.6, 3.6)
     found = half_planes(128).weights(uv[1:2], row_of_points(True, 1.0), off, FIRST, 128)
     assert found.flatten().tolist() == pytest.approx([2.0, 2.0, 0.6, 0.6])
 

@@ -9,7 +9,13 @@ import trimesh
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.rendering import render_depth
-from curvireg_torch.rendering.contours import MAX_OCCLUDING, MeshContours, _spread_evenly
+from curvireg_torch.rendering.contours import (
+    MAX_OCCLUDING,
+    MeshContours,
+    _Columns,
+    _evenly_chosen,
+    _spread_evenly,
+)
 from tests._support import double, eye
 
 K = double([[220.0, 0, 63.5], [0, 220.0, 63.5], [0, 0, 1]])
@@ -120,14 +126,31 @@ def test_a_pose_that_is_no_number_has_no_points_and_leaves_the_others_theirs():
     assert torch.equal(together.model[1:][alone.valid], alone.model[alone.valid])
 
 
-def test_places_lie_evenly_along_the_edges_of_each_pose():
-    """Lengths 1, 0, 3 of the first pose, none of the second, 2 and 2 of the third."""
-    length = torch.tensor([1.0, 0.0, 3.0, 2.0, 2.0, 0.0])
-    pose = torch.tensor([0, 0, 0, 2, 2, 2])
-    number, fraction, valid = _spread_evenly(length, pose, 3, 4)
-    number = number.view(3, 4)
-    assert number[[0, 2]].tolist() == [[0, 2, 2, 2], [3, 3, 4, 4]]
+def test_places_lie_evenly_along_the_edges_of_each_pose_and_kind():
+    """Occluding contours of lengths 1, 0, 3 in the first view, none in the second, 2 and 2 in the
+    third; creases of length 4 in the first and 1 in the second view."""
+    length = torch.tensor([1.0, 0.0, 3.0, 4.0, 1.0, 2.0, 2.0, 0.0])
+    chain = torch.tensor([0, 0, 0, 1, 3, 4, 4, 4])
+    number, fraction, valid = _spread_evenly(length, chain, 3, _Columns(4, 2, length.device))
+    number = number.view(3, 6)
+    assert number[[0, 2], :4].tolist() == [[0, 2, 2, 2], [5, 5, 6, 6]]
+    assert number[:2, 4:].tolist() == [[3, 3], [4, 4]]
     expected = torch.tensor([[1 / 2, 1 / 6, 1 / 2, 5 / 6], [1 / 4, 3 / 4, 1 / 4, 3 / 4]])
-    torch.testing.assert_close(fraction[[0, 2]], expected)
-    assert valid.all(dim=1).tolist() == [True, False, True]
-    assert not valid[1].any()
+    torch.testing.assert_close(fraction[[0, 2], :4], expected)
+    torch.testing.assert_close(fraction[:2, 4:], torch.tensor([[1 / 4, 3 / 4]] * 2))
+    on_contour = valid[:, :4]
+    on_crease = valid[:, 4:]
+    assert on_contour.all(dim=1).tolist() == [True, False, True]
+    assert on_crease.all(dim=1).tolist() == [True, True, False]
+    assert not on_contour[1].any()
+    assert not on_crease[2].any()
+
+
+def test_points_are_chosen_evenly_of_each_kind():
+    """Of four candidates two and of three one."""
+    seen = torch.tensor([[1, 1, 1, 1, 0, 1, 1], [0, 0, 1, 0, 0, 0, 0]], dtype=torch.bool)
+    columns = [_Columns(*counts, seen.device) for counts in ((4, 3), (2, 1))]
+    index, is_point = _evenly_chosen(seen, *columns)
+    assert is_point.tolist() == [[True] * 3, [True, False, False]]
+    assert index[is_point].tolist() == [0, 2, 5, 9]
+    assert index[1, 1:].tolist() == [7, 7]

@@ -108,18 +108,19 @@ def test_a_step_in_depth_is_no_crease(drop, expected):
 
 
 @pytest.mark.parametrize(
-    ("degrees", "smooth", "expected"),
+    ("degrees", "smooth", "occluding", "expected"),
     [
-        (0.0, True, 0.0),
-        (45.0, True, 45.0),
-        (55.0, True, 55.0),
-        (65.0, True, 0.0),  # of another surface, as at the rim of a cone
-        (45.0, False, 0.0),
-        (225.0, True, 45.0),  # outward all the same
+        (0.0, True, True, 0.0),
+        (45.0, True, True, 45.0),
+        (55.0, True, True, 55.0),
+        (65.0, True, True, 0.0),  # of another surface, as at the rim of a cone
+        (45.0, False, True, 0.0),
+        (45.0, True, False, 0.0),
+        (225.0, True, True, 45.0),  # outward all the same
     ],
 )
 def test_normals_of_a_smooth_surface_replace_those_of_edges_they_agree_with(
-    degrees, smooth, expected
+    degrees, smooth, occluding, expected
 ):
     """An edge whose normal in the image is (1, 0), of a surface whose normal is turned from it."""
     angle = np.radians(degrees)
@@ -138,5 +139,5 @@ def test_normals_of_a_smooth_surface_replace_those_of_edges_they_agree_with(
         normal=torch.tensor([[[1.0, 0.0]]]),
         valid=torch.tensor([[True]]),
     )
-    found = _Views._smoothed(views, places).normal[0, 0].tolist()
+    found = _Views._smoothed(views, places, torch.tensor([occluding])).normal[0, 0].tolist()
     assert np.degrees(np.arctan2(found[1], found[0])) == pytest.approx(expected, abs=1e-3)
