@@ -249,12 +249,14 @@ def short_fit(
     K: Tensor,
     T: Tensor,
     image_index: Tensor | None = None,
+    *,
+    radii: Sequence[float] = QUARTER_SIZE_RADII,
 ) -> tuple[Tensor, Tensor]:
     """Poses (N, 4, 4) that a short fit at a quarter of the size reaches from ``T`` (N, 4, 4), in a
     tenth of the time of a fit, and their edge support (N,) with the weights of the mask, which
-    tells where a fit is worth it."""
+    tells where a fit is worth it. Without ``radii``, the poses are not fitted."""
     quarter = ContourProblem.of(contours, crops, K, image_index, factor=4)
-    state = quarter.descend(quarter.state(T), QUARTER_SIZE_RADII)
+    state = quarter.descend(quarter.state(T), radii)
     return state.T, quarter.supports(state)[1]
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..errors import CurviregError
 from ..evidence import Evidence, EvidenceWeights
+from ..fitting.contour_fit import short_fit
 from ..fitting.details import ContourDetails, compared, contour_details
 from ..fitting.edges import EdgeCrops
 from ..geometry.cameras import transform
@@ -425,18 +426,26 @@ def compared_with_mirror_image(
 
 def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses) -> Tensor:
     """(N,) by how much the mirror image of the mesh scores more in a photograph than the mesh at
-    its ``best`` pose, by shape alone and after a short fit; 0 for a mesh that is its own mirror
-    image."""
+    its ``best`` pose, by shape alone and after a short fit; minus infinity where it has less edge
+    support, and for a mesh that is its own mirror image."""
+    gain = torch.full((len(best),), -torch.inf, dtype=torch.float64)
     plane = reflection_plane(target.bank.mesh)
     if plane is None:
-        return torch.zeros(len(best), dtype=torch.float64)
+        return gain
     image = target.mirror_image
     centre = image.describer.centre
     starts = [
         reflected_poses(one, plane, target.describer.centre, centre)
         for one in (best[row] for row in torch.arange(len(best)).split(1))
     ]
-    fitted, _ = with_short_fit(image.describer, crops, Hypotheses.cat(starts))
+    fitted, support = with_short_fit(image.describer, crops, Hypotheses.cat(starts))
+    _, own = by_contours(short_fit, target.describer, crops, best, radii=())
+    highest = support.view(len(best), -1).amax(dim=1)
+    # Of 28 answers to mirrored meshes, all whose mirror image scored more had 1.08 times as much.
+    rows = (highest >= own).nonzero()[:, 0]
+    if not len(rows):
+        return gain
+    fitted = fitted[torch.isin(fitted.photograph, best.photograph[rows])]
     described = Described(
         query=block.query,
         rankings=[Ranking.none()] * len(block),
@@ -448,8 +457,8 @@ def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     seen = evidence_of(image, described, placed(fitted, fitted.short_fit, centre))
     weights = target.score_weights(exact=True)
     of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
-    highest = seen.scores(of_shape).view(len(best), -1).amax(dim=1)
-    return highest - best.evidence.scores(of_shape)
+    score = seen.scores(of_shape).view(len(rows), -1).amax(dim=1)
+    return gain.index_copy(0, rows, score - best[rows].evidence.scores(of_shape))
 
 
 def reflected_poses(
