@@ -162,10 +162,8 @@ class ContourProblem(Rows):
             )
         # The logarithm of 0 takes ten times as long as that of other numbers.
         log = strength.clamp(min=NO_EDGE).log()
-        residual = distance
-        for selection in range(SELECTIONS_PER_STEP):
-            if selection:
-                residual = distance - J @ step[..., None].to(J.dtype)
+
+        def solved(residual: Tensor) -> Tensor:
             # The largest strength times exp(-2 (residual / radius)^2)
             agreement = torch.addcmul(log, residual, residual, value=-2.0 / radius**2)
             index = agreement.max(dim=-1, keepdim=True).indices  # faster than argmax
@@ -175,7 +173,11 @@ class ContourProblem(Rows):
             for more_A, more_b in equations:
                 A = A + more_A
                 b = b + more_b
-            step = self.solution(A, b)
+            return self.solution(A, b)
+
+        step = solved(distance)
+        for _ in range(SELECTIONS_PER_STEP - 1):
+            step = solved(distance - J @ step[..., None].to(J.dtype))
         return step
 
     def solution(self, A: Tensor, b: Tensor) -> Tensor:

@@ -377,9 +377,7 @@ def _spread_evenly(
     return number, fraction.clamp(0.0, 1.0).float(), whole > 0
 
 
-def _evenly_chosen(
-    valid: Tensor, candidates: _Columns, chosen: _Columns
-) -> tuple[Tensor, Tensor]:
+def _evenly_chosen(valid: Tensor, candidates: _Columns, chosen: _Columns) -> tuple[Tensor, Tensor]:
     """Indices (N, M) into the flat (N * L,) of valid entries (N, L), ``candidates`` of each kind:
     the ``chosen`` number of it, evenly where there are more; and which are not padding."""
     by_kind = valid.split(candidates.each.tolist(), dim=1)
