@@ -127,9 +127,7 @@ class ContourProblem(Rows):
 
     def mean_shift(self, points: ContourPoints, before: Tensor, after: Tensor) -> Tensor:
         """(N,) mean shift of the points in px between two poses."""
-        shift = pixels(points.model, after, self.K, self.centre) - pixels(
-            points.model, before, self.K, self.centre
-        )
+        shift = pixels(points.model, after, self.K) - pixels(points.model, before, self.K)
         length = torch.linalg.vector_norm(shift, dim=-1) * points.valid
         mean: Tensor = length.sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
         return mean
@@ -213,7 +211,7 @@ class ContourProblem(Rows):
         """(N,) :meth:`edge_support`, and the same with the weights of the mask, if there is one:
         what fits are compared by."""
         points = state.points
-        uv = pixels(points.model, state.T, self.K, self.centre)
+        uv = pixels(points.model, state.T, self.K)
         counts = self.edges.counts(uv, points.valid, self.image_index)
         near = self._near(uv, points.normals)
         plain = (near.amax(dim=-1).double() * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1)

@@ -57,7 +57,7 @@ def contour_details(
     """What :func:`compare_details` compares."""
     problem = ContourProblem.of(contours, crops, K, image_index)
     points = problem.state(T).points
-    uv = pixels(points.model, T, problem.K, problem.centre)
+    uv = pixels(points.model, T, problem.K)
     strength = problem.strength_near(uv, points.normals)
     counted = points.valid & (problem.edges.counts(uv, points.valid, image_index) > 0)
     return ContourDetails(uv, strength, points.valid, counted)

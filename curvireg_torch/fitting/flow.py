@@ -54,9 +54,7 @@ class Keyframe:
     model: Tensor
 
 
-def track_points(
-    keyframe: Keyframe, frame: Frame, T: Tensor, centre: Tensor, *, levels: int
-) -> PointMatches:
+def track_points(keyframe: Keyframe, frame: Frame, T: Tensor, *, levels: int) -> PointMatches:
     """Corners of a keyframe in a new frame, searched where the pose ``T`` (1, 4, 4) projects them.
     Matches from which the flow does not lead back to the corner have weight 0. A pyramid of
     ``levels`` halvings lets the search reach further."""
@@ -64,7 +62,7 @@ def track_points(
         return PointMatches(
             keyframe.model, torch.zeros(1, 0, 2).double(), torch.zeros(1, 0).double()
         )
-    guess = pixels(keyframe.model, T, frame.K, centre)[0].float().numpy()
+    guess = pixels(keyframe.model, T, frame.K)[0].float().numpy()
     there, found = _optical_flow(keyframe.grey, frame.grey, keyframe.uv, guess, levels)
     back, returned = _optical_flow(frame.grey, keyframe.grey, there, keyframe.uv, RETURN_LEVELS)
     kept = found & returned & (np.linalg.norm(back - keyframe.uv, axis=1) < MAX_RETURN_ERROR)

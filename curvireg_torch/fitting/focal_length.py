@@ -162,7 +162,7 @@ def _measured_matches(
     """Matches of C points, with robust weights of the scale ``radius`` px: their measurements along
     x and y, their pixels (1, 2 C, 2), and the derivatives (1, 2 C, 1) by log f."""
     measured = matches.measurements(T, problem.K, problem.centre, radius)
-    uv = pixels(matches.model, T, problem.K, problem.centre).repeat_interleave(2, dim=1)
+    uv = pixels(matches.model, T, problem.K).repeat_interleave(2, dim=1)
     axes = torch.eye(2, dtype=torch.float64).repeat(matches.model.shape[1], 1)
     return measured, uv, _by_focal_length(problem, T, uv, axes, measured.J)
 

@@ -64,12 +64,10 @@ class PointMatches(Rows):
         axes = torch.eye(2, dtype=self.model.dtype).repeat(self.model.shape[1], 1)[None]
         return self.model.repeat_interleave(2, dim=1), axes
 
-    def inlier_ratio(
-        self, T: Tensor, K: Tensor, centre: Tensor, *, scale: float = INLIER_SCALE
-    ) -> float:
+    def inlier_ratio(self, T: Tensor, K: Tensor, *, scale: float = INLIER_SCALE) -> float:
         """Mean weight, in [0, 1], of the points that were found where the pose has them: a quarter
         of it counts at ``scale`` px."""
-        near = _geman_mcclure(self.uv - pixels(self.model, T, K, centre), scale)
+        near = _geman_mcclure(self.uv - pixels(self.model, T, K), scale)
         return float((near * self.weight).sum()) / max(self.weight.shape[1], 1)
 
     def scaled(self, factor: float) -> "PointMatches":
@@ -145,10 +143,9 @@ def project(
     return uv, torch.cat([by_rotation, by_cam], dim=-1)
 
 
-def pixels(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> Tensor:
+def pixels(points: Tensor, T: Tensor, K: Tensor) -> Tensor:
     """The pixels of :func:`project` without their derivative."""
-    arms = (points - centre) @ T[:, :3, :3].mT
-    cam = arms + point_in_cameras(T, centre)[:, None]
+    cam = torch.baddbmm(T[:, None, :3, 3], points.expand(len(T), -1, -1), T[:, :3, :3].mT)
     return cam @ K[:, :2].mT / cam[..., 2:].clamp(min=1e-9)
 
 

@@ -123,7 +123,7 @@ def contour_evidence(
     """
     problem = ContourProblem.of(contours, crops, K, image_index)
     points = problem.state(T).points
-    uv = pixels(points.model, T, problem.K, problem.centre)
+    uv = pixels(points.model, T, problem.K)
     angle = torch.arange(CHANCE_DIRECTIONS) * (2.0 * math.pi / CHANCE_DIRECTIONS)
     shifts = CHANCE_SHIFT * torch.stack([angle.cos(), angle.sin()], dim=1).to(uv)
     places = torch.cat([uv[None], uv + shifts[:, None, None]])  # as predicted, and shifted

@@ -187,9 +187,7 @@ class _TextureRounds:
         for _ in range(JOINT_STEPS):
             points = matches.measurements(T, K, centre, scales[-1])
             T = self.problem.step(contour_points, T, FULL_SIZE_RADII[0], [points])
-        before, after = (
-            matches.inlier_ratio(at, K, centre, scale=PATCH_INLIER_SCALE) for at in (start, T)
-        )
+        before, after = (matches.inlier_ratio(at, K, scale=PATCH_INLIER_SCALE) for at in (start, T))
         return _Round(T, matches, before, after)
 
     def search(self, T: Tensor, radius: int, samples: int) -> PointMatches | None:

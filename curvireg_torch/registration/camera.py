@@ -443,7 +443,7 @@ def _fitted_to_print(
     if matches is None:
         return None
     fit = fit_focal_length(problem, pose.T, _no_prior(pose.cameras), FULL_RADII, matches)
-    ratio = matches.inlier_ratio(fit.state.T, fit.problem.K, problem.centre)
+    ratio = matches.inlier_ratio(fit.state.T, fit.problem.K)
     if ratio < CONVINCING_RATIO:
         return None
     return fit.log_zoom, _deviation(fit, matches)

@@ -202,15 +202,15 @@ class Tracker:
         """The pose around a start (1, 4, 4)."""
         assert self._last is not None
         first = self._frame(image, K, T)
-        flow = track_points(self._last, first, T, self.centre, levels=PYRAMID_LAST)
-        predicted = pixels(self.hull, T, first.K, self.centre)
+        flow = track_points(self._last, first, T, levels=PYRAMID_LAST)
+        predicted = pixels(self.hull, T, first.K)
         T = fit_points(flow, T, first.K, self.centre, FLOW_SCALES)
-        shift = (pixels(self.hull, T, first.K, self.centre) - predicted).abs().max()
+        shift = (pixels(self.hull, T, first.K) - predicted).abs().max()
         frame = first if float(shift) < WINDOW_SHIFT else self._frame(image, K, T)
         flows = [flow.moved(first.K, frame.K)]
         keyframe = self._keyframes[int(self._angles(T).argmin())]
         if keyframe is not self._last:
-            flows.append(track_points(keyframe, frame, T, self.centre, levels=PYRAMID_KEYFRAME))
+            flows.append(track_points(keyframe, frame, T, levels=PYRAMID_KEYFRAME))
         weights = (POINT_WEIGHT, KEYFRAME_WEIGHT)
         corners = PointMatches.cat_within(
             [flow.scaled(weight) for flow, weight in zip(flows, weights, strict=False)]
@@ -254,7 +254,7 @@ class Tracker:
     def _silhouette(self, frame: Frame, state: ContourState) -> Silhouette:
         """The contour points that have the background beside them."""
         outline = state.points.outline[0]
-        uv = pixels(state.points.model, state.T, frame.K, self.centre)[0, outline]
+        uv = pixels(state.points.model, state.T, frame.K)[0, outline]
         middle = frame.K[0] @ point_in_cameras(state.T, self.centre)[0]
         x, y = (uv - middle[:2] / middle[2]).unbind(-1)
         return Silhouette(uv, state.points.normals[0, outline], torch.atan2(y, x))
@@ -266,7 +266,7 @@ class Tracker:
         clear = torch.exp(-0.125 * mean.square()) * (
             1.0 - 3.0 * variance / REGION_FEATURE_RADIUS**2
         ).clamp(min=0.0)
-        ratios = [flow.inlier_ratio(state.T, frame.K, self.centre) for flow in flows] or [0.0]
+        ratios = [flow.inlier_ratio(state.T, frame.K) for flow in flows] or [0.0]
         features = {
             "edge_support": float(frame.problem.edge_support(state)),
             "region": float(clear.sum()) / max(len(clear), 1),

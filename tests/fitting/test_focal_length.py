@@ -103,7 +103,7 @@ def test_points_of_the_surface_show_the_focal_length_without_edges(wrong):
     problem = replace(problem, edges=blank, mask=None)
     K = focal_length.scaled_cameras(problem.K, -double([wrong]).log())
     model = problem.state(T).points.model[:, ::10]
-    uv = pixels(model, T, K, problem.centre)
+    uv = pixels(model, T, K)
     matches = PointMatches(model, uv, torch.ones(uv.shape[:2], dtype=torch.float64))
     start = focal_length.moved_away(T, double([wrong]).log(), problem.centre)
     none = torch.zeros(1, dtype=torch.float64)

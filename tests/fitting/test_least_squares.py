@@ -38,7 +38,7 @@ def test_project_and_its_derivative():
     expected = torch.autograd.functional.jacobian(moved, TINY)
     uv, derivative = ls.project(points, normals, T, CAMERAS, centre)
     assert_close(uv[0], project_points(points[0], T[0], K))
-    assert_close(ls.pixels(points, T, CAMERAS, centre), uv)
+    assert_close(ls.pixels(points, T, CAMERAS), uv)
     assert_close(derivative[0], expected, rtol=1e-4, atol=1e-3)
 
 
@@ -70,7 +70,7 @@ def test_damping_shortens_each_direction_alike():
 def test_points_need_a_minimum_of_matches():
     truth = pose([0.02, 0.0, 0.01], [0.05, 0.0, 6.1])[None]
     points = uniform(1, 20, 3) - 0.5
-    uv = ls.pixels(points, truth, CAMERAS, ZERO)
+    uv = ls.pixels(points, truth, CAMERAS)
     for count, expected in ((ls.MIN_MATCHES - 1, AHEAD), (ls.MIN_MATCHES, truth)):
         weight = (torch.arange(20) < count).double()[None]
         matches = ls.PointMatches(points, uv, weight)
@@ -80,12 +80,12 @@ def test_points_need_a_minimum_of_matches():
 
 def test_inlier_ratio_counts_all_points():
     points = uniform(1, 10, 3) - 0.5
-    uv = ls.pixels(points, AHEAD, CAMERAS, ZERO)
+    uv = ls.pixels(points, AHEAD, CAMERAS)
     uv[:, :2] += 500.0
     uv[:, 2, 0] += 2.0
     weight = torch.ones(1, 10)
     weight[:, 3:5] = 0.0  # not found
-    ratio = ls.PointMatches(points, uv, weight).inlier_ratio(AHEAD, CAMERAS, ZERO)
+    ratio = ls.PointMatches(points, uv, weight).inlier_ratio(AHEAD, CAMERAS)
     assert ratio == pytest.approx((5 + 0.25) / 10, abs=1e-4)
 
 
@@ -93,7 +93,7 @@ def test_matches_are_measured_along_x_and_y_of_the_image():
     """Of three points, one 0.5 px too far to the right in the image, and one 1 px too low."""
     T = pose([0.1, 0.2, 0.0], [0.0, 0.0, 6.0])[None]
     points = uniform(1, 3, 3) - 0.5
-    uv = ls.pixels(points, T, CAMERAS, ZERO)
+    uv = ls.pixels(points, T, CAMERAS)
     uv[0, 0, 0] += 0.5
     uv[0, 2, 1] += 1.0
     matches = ls.PointMatches(points, uv, double([[1.0, 0.5, 1.0]]))

@@ -78,7 +78,7 @@ def compared_by_print(monkeypatch, factor, matches):
     truth = seen_from(example_mesh(), 40.0, 25.0, radii=2.6)[None]
     seen = ContourProblem.of(describer.contours, crops, camera(1.0)[None])
     model = seen.state(truth).points.model[:, ::20]
-    uv = pixels(model, truth, seen.K, seen.centre)
+    uv = pixels(model, truth, seen.K)
     monkeypatch.setattr(camera_module, "texture_matches", lambda *_: matches(model, uv))
     by_print, by_contours = (
         camera_module.focal_gaps(describer, crops, pose, torch.tensor([printed]))[0]

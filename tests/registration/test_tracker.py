@@ -106,21 +106,21 @@ def keyframe_of(window, T, depth):
 def test_flow_finds_the_corners_of_a_moved_plate_and_their_pose():
     window, T, depth = plate()
     other, truth, _ = plate(0.15, -0.1)  # 12 px and -8 px
-    flow = track_points(keyframe_of(window, T, depth), other, T, ZERO, levels=3)
+    flow = track_points(keyframe_of(window, T, depth), other, T, levels=3)
     there = flow.weight[0] > 0
     assert there.double().mean() > 0.8
-    error = (flow.uv - pixels(flow.model, truth, WINDOW_K, ZERO)).norm(dim=-1)[0, there]
+    error = (flow.uv - pixels(flow.model, truth, WINDOW_K)).norm(dim=-1)[0, there]
     assert error.median() < 0.1
     assert torch.allclose(fit_points(flow, T, WINDOW_K, ZERO, FLOW_SCALES), truth, atol=5e-3)
-    assert flow.inlier_ratio(truth, WINDOW_K, ZERO) > 0.8
-    assert flow.inlier_ratio(T, WINDOW_K, ZERO) < 0.05  # 14 px beside
+    assert flow.inlier_ratio(truth, WINDOW_K) > 0.8
+    assert flow.inlier_ratio(T, WINDOW_K) < 0.05  # 14 px beside
 
 
 def test_flow_back_starts_at_the_corner():
     """After a motion of 60 px that is predicted, it finds it without a high pyramid."""
     window, T, depth = plate(-0.3)
     other, truth, _ = plate(0.45)
-    flow = track_points(keyframe_of(window, T, depth), other, truth, ZERO, levels=1)
+    flow = track_points(keyframe_of(window, T, depth), other, truth, levels=1)
     assert (flow.weight[0] > 0).double().mean() > 0.8
 
 
@@ -129,13 +129,13 @@ def test_flow_that_does_not_lead_back_is_left_out_and_a_uniform_surface_has_none
     window, T, depth = plate()
     covered = framed(window.grey.copy())
     covered.grey[:, 128:] = np.random.default_rng(0).integers(0, 255, (256, 128))
-    flow = track_points(keyframe_of(window, T, depth), covered, T, ZERO, levels=1)
+    flow = track_points(keyframe_of(window, T, depth), covered, T, levels=1)
     right = flow.model[0, :, 0] > 0.1
     assert (flow.weight[0, right] > 0).double().mean() < 0.2
     assert (flow.weight[0, ~right] > 0).double().mean() > 0.7
     bare = framed(np.full_like(window.grey, 90))
-    flow = track_points(keyframe_of(bare, T, depth), window, T, ZERO, levels=1)
-    assert (flow.uv.shape, flow.inlier_ratio(T, WINDOW_K, ZERO)) == ((1, 0, 2), 0.0)
+    flow = track_points(keyframe_of(bare, T, depth), window, T, levels=1)
+    assert (flow.uv.shape, flow.inlier_ratio(T, WINDOW_K)) == ((1, 0, 2), 0.0)
     assert torch.equal(fit_points(flow, T, WINDOW_K, ZERO, FLOW_SCALES), T)
 
 
@@ -158,7 +158,7 @@ def test_a_step_follows_edges_the_end_of_the_colours_and_corners(monkeypatch):
         ContourProblem, "selected_step", lambda *x: given.extend(x) or torch.zeros(1, 6)
     )
     model = uniform(1, 9, 3) - 0.5
-    uv = pixels(model, START[None], found.frame.K, follow.centre)
+    uv = pixels(model, START[None], found.frame.K)
     corners = PointMatches(model, uv, torch.ones(1, 9).double())
     follow._step(found.frame, found.state, corners, 4.0)
     _, points, _, J, _, (equations,) = given
@@ -192,7 +192,7 @@ def test_directions_lead_from_the_centre_of_the_object():
     shifted = found.frame.K.clone()
     shifted[0, 0, 2] += 20.0
     silhouette = follow._silhouette(replace(found.frame, K=shifted), found.state)
-    middle = pixels(follow.centre[None, None], START[None], shifted, follow.centre)[0]
+    middle = pixels(follow.centre[None, None], START[None], shifted)[0]
     away = torch.stack([silhouette.directions.cos(), silhouette.directions.sin()], dim=1)
     arms = silhouette.uv - middle
     assert torch.allclose(away * arms.norm(dim=1, keepdim=True), arms)
