@@ -194,7 +194,10 @@ class _Columns:
         return len(self.kind)
 
 
-_columns = lru_cache(maxsize=16)(_Columns)
+@lru_cache(maxsize=16)
+def _columns(density: float, occluding: int, creases: int, device: torch.device) -> _Columns:
+    """A ``density``, the fraction of these numbers."""
+    return _Columns(round(density * occluding), round(density * creases), device)
 
 
 class _Views:
@@ -234,13 +237,8 @@ class _Views:
     def points(self, density: float) -> ContourPoints:
         """The points on occluding contours, then those on creases."""
         device = self.level.device
-        candidates, chosen = (
-            _columns(round(density * occluding), round(density * creases), device)
-            for occluding, creases in (
-                (OCCLUDING_CANDIDATES, CREASE_CANDIDATES),
-                (MAX_OCCLUDING, MAX_CREASES),
-            )
-        )
+        candidates = _columns(density, OCCLUDING_CANDIDATES, CREASE_CANDIDATES, device)
+        chosen = _columns(density, MAX_OCCLUDING, MAX_CREASES, device)
         on_crease = candidates.kind > 0
         places = self._smoothed(self._spread(candidates), ~on_crease)
         aside = torch.where(on_crease, 0.0, ASIDE)[:, None]

@@ -116,6 +116,11 @@ def test_points_of_the_surface_show_the_focal_length_without_edges(wrong):
     assert abs(float(exact.step)) < 2e-3
     half = focal_length.focal_information(found.problem, found.state, 2.0, matches.scaled(0.5))[0]
     assert float(half.amount) == pytest.approx(0.5 * float(exact.amount), rel=1e-3)
+    uv[:, ::4] += 12.0  # wrong matches, beyond the scale of the weights
+    robust = focal_length.fit_focal_length(
+        problem, start, prior, FULL_SIZE_RADII, replace(matches, uv=uv)
+    )
+    assert float(robust.log_zoom) == pytest.approx(float(found.log_zoom), abs=0.01)
 
 
 @pytest.mark.parametrize(

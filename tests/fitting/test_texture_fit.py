@@ -15,10 +15,12 @@ from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.fitting.texture_fit import (
+    CONVINCING_RATIO,
     _TextureRounds,
     fit_texture,
     match_patches,
     rotated_starts,
+    texture_matches,
 )
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.geometry.cameras import projected_boxes, transform
@@ -60,6 +62,22 @@ def fit(renderer, image, starts, mesh=MESH, drawn=None):
     return fit_texture(
         draw, renderer, ContourProblem.of(CONTOURS, crops, CAMERA[None]), crops.crops[0], starts
     )
+
+
+@pytest.mark.parametrize(("aside", "is_found"), [(9.0, True), (16.0, False)])
+def test_matches_of_a_fitted_pose_lie_within_twelve_pixels(renderer, aside, is_found):
+    crops = EdgeCrops.cut([image()], BOX.float(), 0.1)
+    problem = ContourProblem.of(CONTOURS, crops, CAMERA[None])
+    shift = torch.zeros(1, 6, dtype=torch.float64)
+    shift[0, 3] = aside * TRUTH[0, 2, 3] / problem.K[0, 0, 0]
+    start = apply_twist(TRUTH, shift, CENTRE)
+
+    def draw(T, K, size, samples):
+        return render_colour(MESH, T, K, size, renderer=renderer, supersampling=samples)
+
+    matches = texture_matches(draw, renderer, problem, crops.crops[0], start)
+    right = matches is not None and matches.inlier_ratio(TRUTH, problem.K) > CONVINCING_RATIO
+    assert right == is_found
 
 
 def error(found):

@@ -10,6 +10,7 @@ from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.least_squares import PointMatches, pixels
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.registration import camera as camera_module
+from curvireg_torch.registration.block import Block
 from curvireg_torch.registration.camera import focal_contradiction
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
@@ -72,19 +73,19 @@ def test_focal_lengths_of_several_photographs_are_compared_at_once(monkeypatch):
 
 
 def compared_by_print(monkeypatch, factor, matches):
-    """The gap of :func:`registered` where matches, made by a function of the pixels at which the
-    photograph shows points of the mesh, are found in it; and the gap by contours alone."""
+    """Gap and deviation of :func:`registered` where matches, made by a function of the pixels at
+    which the photograph shows points of the mesh, are found in it; and those by contours alone."""
     describer, crops, pose, _ = registered(factor)[1]
     truth = seen_from(example_mesh(), 40.0, 25.0, radii=2.6)[None]
     seen = ContourProblem.of(describer.contours, crops, camera(1.0)[None])
     model = seen.state(truth).points.model[:, ::20]
     uv = pixels(model, truth, seen.K)
     monkeypatch.setattr(camera_module, "texture_matches", lambda *_: matches(model, uv))
-    by_print, by_contours = (
-        camera_module.focal_gaps(describer, crops, pose, torch.tensor([printed]))[0]
+    found = [
+        camera_module.focal_gaps(describer, crops, pose, torch.tensor([printed]))
         for printed in (True, False)
-    )
-    return float(by_print), float(by_contours)
+    ]
+    return [(float(gap), float(deviation)) for gap, deviation in found]
 
 
 def as_matches(model, uv):
@@ -92,11 +93,16 @@ def as_matches(model, uv):
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.3])
-def test_a_print_shows_the_focal_length(monkeypatch, factor):
-    monkeypatch.setattr(camera_module, "WITHIN_REACH", 0.0)  # contours tell too little
+def test_a_print_shows_the_focal_length_better_than_contours(monkeypatch, factor):
     by_print, by_contours = compared_by_print(monkeypatch, factor, as_matches)
-    assert by_print == pytest.approx(-math.log(factor), abs=0.02)
-    assert by_contours == 0.0
+    truth = -math.log(factor)
+    assert by_print[0] == pytest.approx(truth, abs=0.02)
+    assert abs(by_print[0] - truth) < abs(by_contours[0] - truth)
+    assert by_print[1] < by_contours[1]
+    few = compared_by_print(monkeypatch, factor, lambda *seen: as_matches(*seen).scaled(0.1))[0]
+    assert few[1] > 1.2 * by_print[1], "matches that count less"
+    monkeypatch.setattr(camera_module, "WITHIN_REACH", 0.0)  # contours tell too little
+    assert compared_by_print(monkeypatch, factor, as_matches) == [by_print, (0.0, torch.inf)]
 
 
 @pytest.mark.parametrize(
@@ -105,7 +111,21 @@ def test_a_print_shows_the_focal_length(monkeypatch, factor):
 )
 def test_a_print_that_is_not_found_is_no_evidence(monkeypatch, matches):
     by_print, by_contours = compared_by_print(monkeypatch, 1.3, matches)
-    assert by_print == by_contours < -0.2
+    assert by_print == by_contours
+    assert by_print[0] < -0.2
+
+
+@pytest.mark.parametrize("keypoints", [0.0, 0.1])
+def test_prints_are_those_of_photographs_in_which_keypoints_count(monkeypatch, keypoints):
+    image, box = near_photograph()
+    given = []
+    nothing = torch.zeros(1)
+    monkeypatch.setattr(Block, "printed", lambda *_: keypoints)
+    monkeypatch.setattr(
+        camera_module, "focal_gaps", lambda *a: given.append(a[-1]) or (nothing, nothing)
+    )
+    learned_registrar()([image], box[None], camera(1.0))
+    assert torch.cat(given).tolist() == [keypoints > 0.0]
 
 
 def test_contradictions_need_a_clear_focal_length_two_deviations_and_a_distance_that_matters():

@@ -7,7 +7,15 @@ import trimesh
 from curvireg_torch import sample_views
 from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
 from curvireg_torch.registration import judging
-from tests._support import answer_of, bank_of, double, exact_registrar, learned_registrar, scene
+from tests._support import (
+    CAMERA,
+    answer_of,
+    bank_of,
+    double,
+    exact_registrar,
+    learned_registrar,
+    scene,
+)
 from tests._support.hypotheses import placed_at
 from tests._support.poses import poses as random_poses
 
@@ -72,9 +80,13 @@ def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
     image, box, _ = scene(0)
     own = learned_registrar()
     assert answer_of(own, image, box).reliable
+    assert gains == [-torch.inf], "the mirror image has less edge support"
     views = sample_views(azimuth_step=30, elevations=[0, 30, 60])
     bank = bank_of(mirrored(own.bank.mesh), views, image_size=96)
     monkeypatch.setattr(judging, "LEAST_CONFIDENCE", 0.0)
-    flipped = answer_of(exact_registrar(bank), image, box)
-    assert judging.MIRROR_WARNING in flipped.warnings
-    assert gains[0] < 0.0 < gains[1]
+    last = image.shape[-1] - 1
+    x0, y0, x1, y1 = box.tolist()
+    boxes = torch.tensor([[x0, y0, x1, y1], [last - x1, y0, last - x0, y1]])
+    both = exact_registrar(bank)([image, image.flip(-1)], boxes, CAMERA)
+    assert [judging.MIRROR_WARNING in result.warnings for result in both] == [True, False]
+    assert gains[1] > 0.0 > gains[2]
