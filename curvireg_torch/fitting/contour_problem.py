@@ -200,7 +200,7 @@ class ContourProblem(Rows):
         curvature = (before - 2.0 * here + behind).clamp(max=-1e-9)
         # of the parabola through the three values
         vertex = (0.5 * (before - behind) / curvature).clamp(-0.5, 0.5)
-        middle = torch.tensor(offsets[1:-1], device=uv.device)
+        middle = torch.tensor(offsets[1:-1], dtype=torch.float32, device=uv.device)
         return middle + vertex, torch.where(is_peak, here, 0.0)
 
     def edge_support(self, state: ContourState) -> Tensor:
@@ -231,8 +231,9 @@ class ContourProblem(Rows):
     def _near(self, uv: Tensor, normals: Tensor) -> Tensor:
         """(N, P, 7) strengths at ``NEAR`` px along the normals, which fall with the distance from
         the point."""
+        offsets = torch.tensor(NEAR, dtype=torch.float32, device=uv.device)
         strength = self.edges.strength(uv, normals, NEAR, self.image_index)
-        return strength * torch.exp(-0.5 * torch.tensor(NEAR, device=uv.device) ** 2)
+        return strength * torch.exp(-0.5 * offsets**2)
 
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:
         """The edges that a least-squares step without a mask would use."""

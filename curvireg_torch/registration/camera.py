@@ -402,8 +402,8 @@ def focal_gaps(
         describer: of the mesh.
         crops: of the photographs.
         poses: N > 0 of them.
-        printed: (N,) bool, whether the photograph shows a print of the mesh, by which then focal
-            lengths are fitted as well.
+        printed: (N,) bool, whether the photograph shows a print of the mesh, to which the focal
+            length is then fitted as well.
 
     Returns:
         (N,) by how much the log of the focal length that a photograph shows exceeds that of its

@@ -241,8 +241,8 @@ class _Views:
         chosen = _columns(density, MAX_OCCLUDING, MAX_CREASES, device)
         on_crease = candidates.kind > 0
         places = self._smoothed(self._spread(candidates), ~on_crease)
-        aside = torch.where(on_crease, 0.0, ASIDE)[:, None]
-        rays = _rays_to(places.at) + (aside / self.focal_lengths) * places.normal
+        aside = (ASIDE / self.focal_lengths).masked_fill(on_crease[:, None], 0.0)
+        rays = _rays_to(places.at) + aside * places.normal
         depth = self.depth_of(rays, None)
         behind = depth - places.at[..., 2]
         least = torch.where(on_crease, -VISIBLE_TOLERANCE, OCCLUSION_JUMP)
