@@ -180,12 +180,13 @@ class _Places(Rows):
 
 class _Columns:
     """M columns of a table of views: first those on occluding contours, of kind 0, then those on
-    creases, of kind 1. ``each`` (2,) tells how many there are of each kind, ``kind`` (M,) the kind
-    of each column, ``place`` (M,) its number within the kind, of ``of_kind`` (M,)."""
+    creases, of kind 1. ``sizes`` and ``each`` (2,) tell how many there are of each kind, ``kind``
+    (M,) the kind of each column, ``place`` (M,) its number within the kind, of ``of_kind``
+    (M,)."""
 
     def __init__(self, occluding: int, creases: int, device: torch.device) -> None:
-        self.occluding = occluding
-        self.each = torch.tensor([occluding, creases], device=device)
+        self.sizes = [occluding, creases]
+        self.each = torch.tensor(self.sizes, device=device)
         self.kind = torch.arange(2, device=device).repeat_interleave(self.each)
         self.place = torch.arange(len(self.kind), device=device) - occluding * self.kind
         self.of_kind = self.each[self.kind]
@@ -247,7 +248,7 @@ class _Views:
         behind = depth - places.at[..., 2]
         least = torch.where(on_crease, -VISIBLE_TOLERANCE, OCCLUSION_JUMP)
         is_seen = places.valid & (behind > least)
-        first = candidates.occluding
+        first, _ = candidates.sizes
         self._keep_folds(places[:, first:], rays[:, first:], is_seen[:, first:])
         return self._chosen(places, is_seen, depth.isinf() & ~on_crease, candidates, chosen)
 
@@ -378,7 +379,7 @@ def _spread_evenly(
 def _evenly_chosen(valid: Tensor, candidates: _Columns, chosen: _Columns) -> tuple[Tensor, Tensor]:
     """Indices (N, M) into the flat (N * L,) of valid entries (N, L), ``candidates`` of each kind:
     the ``chosen`` number of it, evenly where there are more; and which are not padding."""
-    by_kind = valid.split(candidates.each.tolist(), dim=1)
+    by_kind = valid.split(candidates.sizes, dim=1)
     count = torch.stack([of_kind.sum(dim=1) for of_kind in by_kind], dim=1)
     first = (count.flatten().cumsum(dim=0).view_as(count) - count).index_select(1, chosen.kind)
     count = count.index_select(1, chosen.kind)
