@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
+from ..rendering.contours import ContourPoints
 from .contour_problem import STEPS_PER_ROUND, ContourProblem, ContourState
 from .least_squares import (
     Measurements,
     PointMatches,
     apply_twist,
     damped_solution,
-    pixels,
     project,
     residual_variance,
     summed_by_cells,
@@ -89,11 +89,7 @@ def fit_focal_length(
         information, _ = focal_information(problem, state, radius, matches)
         stiffness = information.scale / prior.deviation**2
         for _ in range(STEPS_PER_ROUND):
-            uv, J = project(
-                state.points.model, state.points.normals, state.T, problem.K, problem.centre
-            )
-            by_focal = _by_focal_length(problem, state.T, uv, state.points.normals, J)
-            J = torch.cat([J, by_focal], dim=-1)
+            uv, J = _projected(problem, state.T, state.points)
             gap = prior.log_zoom - log_zoom
             pull = stiffness * (prior.reach / gap.abs().clamp(min=1e-9)).clamp(max=1.0)
             A = torch.zeros(len(T), 7, 7, dtype=torch.float64)
@@ -102,9 +98,9 @@ def fit_focal_length(
             b[:, 6, 0] = pull * gap
             others = [(A, b)]
             if matches is not None:
-                found, _, by_focal = _measured_matches(problem, state.T, matches, radius)
-                found = replace(found, J=torch.cat([found.J, by_focal], dim=-1))
-                others.append(found.equations())
+                found = matches.measurements(state.T, problem.K, problem.centre, radius)
+                _, by_all = _projected(problem, state.T, matches.points)
+                others.append(replace(found, J=by_all).equations())
             step = problem.selected_step(state.points, uv, J, radius, others)
             fraction = problem.step_fraction(step[:, :6], state.T)
             fraction = torch.minimum(fraction, MAX_FOCAL_STEP / step[:, 6].abs().clamp(min=1e-9))
@@ -146,25 +142,13 @@ def _motion_with_focal_length(T: Tensor, centre: Tensor) -> Tensor:
     return torch.cat([turn, away], dim=1)
 
 
-def _by_focal_length(
-    problem: ContourProblem, T: Tensor, uv: Tensor, normals: Tensor, J: Tensor
-) -> Tensor:
-    """(N, P, 1) derivative by log f of the shift of points at ``uv`` (N, P, 2) px along ``normals``
-    (..., P, 2), with the motion of :func:`moved_away`; ``J`` (N, P, 6) is that by the pose."""
-    zoom = ((uv - problem.K[:, None, :2, 2]) * normals).sum(dim=-1, keepdim=True)
+def _projected(problem: ContourProblem, T: Tensor, points: ContourPoints) -> tuple[Tensor, Tensor]:
+    """Pixels (N, P, 2) of points of the mesh, and the derivative (N, P, 7) of their shift along
+    their normals by the pose and, with the motion of :func:`moved_away`, by log f."""
+    uv, J = project(points.model, points.normals, T, problem.K, problem.centre)
+    zoom = ((uv - problem.K[:, None, :2, 2]) * points.normals).sum(dim=-1, keepdim=True)
     motion = _motion_with_focal_length(T, problem.centre)
-    return zoom + J @ motion[..., None]
-
-
-def _measured_matches(
-    problem: ContourProblem, T: Tensor, matches: PointMatches, radius: float
-) -> tuple[Measurements, Tensor, Tensor]:
-    """Matches of C points, with robust weights of the scale ``radius`` px: their measurements along
-    x and y, their pixels (1, 2 C, 2), and the derivatives (1, 2 C, 1) by log f."""
-    measured = matches.measurements(T, problem.K, problem.centre, radius)
-    uv = pixels(matches.model, T, problem.K).repeat_interleave(2, dim=1)
-    axes = torch.eye(2, dtype=torch.float64).repeat(matches.model.shape[1], 1)
-    return measured, uv, _by_focal_length(problem, T, uv, axes, measured.J)
+    return uv, torch.cat([J, zoom + J @ motion[..., None]], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -192,15 +176,14 @@ def focal_information(
     """What edges within ``radius`` px, and ``matches``, tell of log f beyond what motions of the
     object could imitate, with errors as in :func:`pose_covariance`; and (N, 6), how the best pose
     moves with log f."""
+    points = state.points
     measured = problem.measured_edges(state, radius)
-    uv, J = project(state.points.model, state.points.normals, state.T, problem.K, problem.centre)
-    by_focal = _by_focal_length(problem, state.T, uv, state.points.normals, J)
     if matches is not None:
-        found, at, of_points = _measured_matches(problem, state.T, matches, radius)
+        points = ContourPoints.cat_within([points, matches.points])
+        found = matches.measurements(state.T, problem.K, problem.centre, radius)
         measured = Measurements.cat_within([measured, found])
-        uv = torch.cat([uv, at], dim=1)
-        J = measured.J
-        by_focal = torch.cat([by_focal, of_points], dim=1)
+    uv, by_all = _projected(problem, state.T, points)
+    J, by_focal = by_all.split([6, 1], dim=-1)
     W = measured.weight
     imitation = damped_solution(J.mT @ (W * J), J.mT @ (W * by_focal), 1e-6)
     own = by_focal - J @ imitation[..., None]

@@ -51,18 +51,20 @@ class PointMatches(Rows):
 
     def measurements(self, T: Tensor, K: Tensor, centre: Tensor, scale: float) -> Measurements:
         """Two for each point, along x and y, with Geman-McClure weights of ``scale`` px."""
-        uv, J = project(*self._twice, T, K, centre)
+        uv, J = project(self.points.model, self.points.normals, T, K, centre)
         residual = self.uv - uv[:, ::2]
         weight = self.weight * _geman_mcclure(residual, scale)
         weights = weight[..., None].expand_as(residual)
         return Measurements(J, residual.flatten(1)[..., None], weights.flatten(1)[..., None])
 
     @cached_property
-    def _twice(self) -> tuple[Tensor, Tensor]:
-        """Each point (1, 2 C, 3), along the x axis of the image and along its y axis (1, 2 C,
-        2)."""
-        axes = torch.eye(2, dtype=self.model.dtype).repeat(self.model.shape[1], 1)[None]
-        return self.model.repeat_interleave(2, dim=1), axes
+    def points(self) -> ContourPoints:
+        """Each point twice (1, 2 C), with normals along the x axis of the image and along its y
+        axis."""
+        model = self.model.repeat_interleave(2, dim=1)
+        axes = torch.eye(2, dtype=model.dtype).repeat(self.model.shape[1], 1)[None]
+        seen = torch.ones(model.shape[:2], dtype=torch.bool)
+        return ContourPoints(model, axes, seen, ~seen)
 
     def inlier_ratio(self, T: Tensor, K: Tensor, *, scale: float = INLIER_SCALE) -> float:
         """Mean weight, in [0, 1], of the points that were found where the pose has them: a quarter

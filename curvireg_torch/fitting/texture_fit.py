@@ -115,12 +115,7 @@ def fit_texture(
     after = problem.edge_support(state)
     if bool(after < support - MAX_SUPPORT_LOSS):
         return None
-    # Matches count as points with normals along x and y.
-    count = fine.matches.model.shape[1]
-    seen = torch.ones(1, 2 * count, dtype=torch.bool)
-    axes = torch.eye(2, dtype=torch.float64).repeat(count, 1)[None]
-    points = ContourPoints(fine.matches.model.repeat_interleave(2, 1), axes, seen, ~seen)
-    joined = ContourPoints.cat_within([state.points, points])
+    joined = ContourPoints.cat_within([state.points, fine.matches.points])
     found = fine.matches.measurements(state.T, problem.K, problem.centre, NEAR_ROUND[1][-1])
     edges = problem.measured_edges(state, FULL_SIZE_RADII[-1])
     both = Measurements.cat_within([edges, found])

@@ -419,7 +419,8 @@ def focal_gaps(
     noticed = first.step.abs() > NOTICED_STEP
     by_contours = noticed & (expected < WITHIN_REACH)
     for row in (noticed & printed).nonzero()[:, 0].tolist():
-        found = _fitted_to_print(describer, crops, poses[row : row + 1])
+        one = slice(row, row + 1)
+        found = _fitted_to_print(describer, crops, poses[one], problem[one])
         if found is not None:
             gap[row], deviation[row] = found
             by_contours[row] = False
@@ -432,11 +433,10 @@ def focal_gaps(
 
 
 def _fitted_to_print(
-    describer: ViewDescriber, crops: EdgeCrops, pose: Hypotheses
+    describer: ViewDescriber, crops: EdgeCrops, pose: Hypotheses, problem: ContourProblem
 ) -> tuple[Tensor, Tensor] | None:
-    """Gap and deviation, see :func:`focal_gaps`, by contours and the print together, of one pose;
-    None where not enough of the print is found."""
-    problem = ContourProblem.of(describer.contours, crops, pose.cameras, pose.photograph)
+    """Gap and deviation, see :func:`focal_gaps`, by contours and the print together, of one pose,
+    that of a ``problem`` at full size; None where not enough of the print is found."""
     problem = replace(problem, mask=None)
     photograph = crops.crops[int(pose.photograph)]
     matches = texture_matches(describer.draw, describer.renderer, problem, photograph, pose.T)

@@ -67,9 +67,23 @@ def test_focal_lengths_of_several_photographs_are_compared_at_once(monkeypatch):
     assert gaps.tolist() == pytest.approx([0.357, 0.0, -0.262], abs=0.04)
     assert deviations[1] == torch.inf, "the first step is small: nobody looked further"
     assert float(deviations[0]) < 0.15
-    monkeypatch.setattr(camera_module, "CLEAR_DEVIATION", float(deviations[0]))
+    monkeypatch.setattr(camera_module, "CLEAR_DEVIATION", float(deviations.min()))
     strict = camera_module.focal_gaps(describer, crops, poses, printed)[1]
-    assert strict[0] == torch.inf, "as clear as that, it is not determined"
+    assert strict.isinf().all(), "as clear as that, none is determined"
+
+
+def test_the_print_of_each_photograph_is_compared_with_its_own_pose(monkeypatch):
+    given = [registered(factor)[1] for factor in (1.0, 0.7, 1.3)]
+    describer, crops = given[0][:2]
+    poses = Hypotheses.cat([one[2] for one in given])
+
+    def missing(_, __, pose, problem):
+        assert torch.equal(problem.K[0], (crops.transforms[0] @ pose.cameras[0]))
+        return (FOCAL / pose.cameras[:, 0, 0]).log(), torch.tensor([0.01])
+
+    monkeypatch.setattr(camera_module, "_fitted_to_print", missing)
+    gaps, _ = camera_module.focal_gaps(describer, crops, poses, torch.tensor([True] * 3))
+    assert gaps.tolist() == pytest.approx([0.0, -math.log(0.7), -math.log(1.3)])
 
 
 def compared_by_print(monkeypatch, factor, matches):
