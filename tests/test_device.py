@@ -7,7 +7,7 @@ from torch.testing import assert_close
 import curvireg_torch as cr
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh
-from tests._support import CAMERA, bank_of, exact_registrar, scene, truck_bank
+from tests._support import CAMERA, bank_of, scene, truck_bank
 
 VIEWS = cr.sample_views(azimuth_step=45, elevations=[10, 40])
 MODULES = [cr.ApparentRidges, cr.AverageShadingGradient, cr.DepthCurvilinearSaliency, cr.EdgeBlur]
@@ -73,10 +73,10 @@ def test_presets_on_a_gpu(preset):
 
 def test_registrar_ignores_the_default_dtype():
     image, box, _ = scene(0)
-    expected = exact_registrar(truck_bank())([image], box[None], CAMERA)[0]
+    expected = cr.Registrar(truck_bank())([image], box[None], CAMERA)[0]
     torch.set_default_dtype(torch.float64)
     try:
-        result = exact_registrar(truck_bank())([image], box[None], CAMERA)[0]
+        result = cr.Registrar(truck_bank())([image], box[None], CAMERA)[0]
     finally:
         torch.set_default_dtype(torch.float32)
     assert_close(result.transform, expected.transform, atol=1e-6, rtol=0.0)

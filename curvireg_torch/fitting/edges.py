@@ -178,9 +178,9 @@ class _Pictures:
 def _sampling(
     offsets: tuple[float, ...], width: int, height: int, ratio: float, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """From px, ``ratio`` of which are one of a picture, to the units of grid_sample, in which the
-    sides of a picture are 2: (2,) the scale and the shift of points; and the (4, 2 L) matrix that
-    takes the scaled x and y of a point and its normal to places at L offsets."""
+    """From px, each of which is ``ratio`` px of a picture, to the units of grid_sample, in which
+    the sides of a picture are 2: (2,) the scale and the shift of points; and the (4, 2 L) matrix
+    that takes the scaled x and y of a point and its normal to places at L offsets."""
     unit = torch.tensor([2.0 / width, 2.0 / height], dtype=torch.float64, device=device)
     scale = ratio * unit
     along = torch.tensor(offsets, dtype=torch.float32, device=device)

@@ -441,7 +441,8 @@ def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     fitted, support = with_short_fit(image.describer, crops, Hypotheses.cat(starts))
     _, own = by_contours(short_fit, target.describer, crops, best, radii=())
     highest = support.view(len(best), -1).amax(dim=1)
-    # Of 28 answers to mirrored meshes, all whose mirror image scored more had 1.08 times as much.
+    # Of 28 answers to mirrored meshes, all that the mirror image makes doubtful had 1.08 times as
+    # much and more.
     rows = (highest >= own).nonzero()[:, 0]
     if not len(rows):
         return gain

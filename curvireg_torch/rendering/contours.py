@@ -249,7 +249,7 @@ class _Views:
         least = torch.where(on_crease, -VISIBLE_TOLERANCE, OCCLUSION_JUMP)
         is_seen = places.valid & (behind > least)
         first, _ = candidates.sizes
-        self._keep_folds(places[:, first:], rays[:, first:], is_seen[:, first:])
+        is_seen[:, first:] &= self._is_fold(places[:, first:], rays[:, first:], is_seen[:, first:])
         return self._chosen(places, is_seen, depth.isinf() & ~on_crease, candidates, chosen)
 
     def _spread(self, columns: _Columns) -> _Places:
@@ -301,9 +301,9 @@ class _Views:
         normal = torch.where(agrees, cosine.sign() * smooth, places.normal)
         return replace(places, normal=normal)
 
-    def _keep_folds(self, places: _Places, rays: Tensor, is_seen: Tensor) -> None:
-        """Mark places (N, M) on creases as not seen, to which ``rays`` (N, M, 2) lead, where the
-        surface is not folded at the scale of the crop."""
+    def _is_fold(self, places: _Places, rays: Tensor, is_seen: Tensor) -> Tensor:
+        """(N, M) bool: which places on creases, to which ``rays`` (N, M, 2) lead, fold the surface
+        at the scale of the crop; only where they are seen is it looked up."""
         z = places.at[..., 2]
         step = CREASE_SCALE * self.size
         aside = (step / self.focal_lengths) * places.normal
@@ -312,7 +312,7 @@ class _Views:
         ahead, back = depth.chunk(2, dim=1)
         bend = (ahead - 2.0 * z + back).abs() * (self.focal_lengths[..., 0] / step) / z
         largest_jump = torch.maximum((ahead - z).abs(), (back - z).abs())
-        is_seen &= (bend > CREASE_BEND) & (largest_jump < 2.0 * OCCLUSION_JUMP)
+        return (bend > CREASE_BEND) & (largest_jump < 2.0 * OCCLUSION_JUMP)
 
     def _chosen(
         self,
