@@ -21,7 +21,14 @@ from ..geometry.pose_prior import object_frame
 from ..matching import Ranking, ViewBank
 from ..mesh.mesh import mesh_centre, mesh_radius
 from ..terms import Appearance, QueryFeatures
-from .hypotheses import Hypotheses, by_contours, fit_poses, placed
+from .hypotheses import (
+    Hypotheses,
+    by_contours,
+    close_rivals,
+    distinct_poses,
+    fit_poses,
+    placed,
+)
 from .photograph import Photograph
 from .target import Target, nearest_view
 
@@ -435,3 +442,47 @@ def fitted_poses(
     kept = starts[left]
     seen = by_contours(measure_contours, target.describer, crops, kept)
     return poses.replaced(left, kept.with_fit(seen, target.describer.centre))
+
+
+def refitted(target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses) -> Hypotheses:
+    """Fit the best pose of each photograph again from where it is, then its close rivals: fits that
+    differ in effort cannot be compared. Results with a higher score are kept."""
+    weights = target.score_weights(exact=True)
+    best = poses.best(weights)
+    poses = _refitted(target, block, crops, poses, best)
+    scores = poses.scores(weights)
+    settings = target.pipeline.fit
+    close = []
+    different = []
+    for photograph in poses.photograph[best].tolist():
+        rows = poses.of(photograph)
+        some = poses[rows]
+        rivals = close_rivals(some, scores[rows], block.symmetries, behind=settings.close_score)
+        distinct = distinct_poses(
+            some[rivals], scores[rows][rivals], block.symmetries, angle=settings.same_pose_angle
+        )
+        close.append(rows[rivals])
+        different.append(rows[rivals[distinct][: settings.close_rivals]])
+    rivals = torch.cat(close)
+    if not len(rivals):
+        return poses
+    poses = _refitted(target, block, crops, poses, torch.cat(different))
+    return with_details(target, crops, poses, best, rivals)
+
+
+def _refitted(
+    target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses, index: Tensor
+) -> Hypotheses:
+    """Fit poses again, and keep the results that have a higher score."""
+    if not len(index):
+        return poses
+    before = poses[index]
+    fitted = fitted_poses(target, block, crops, before, refit=True)
+    moved = (before.T != fitted.T).flatten(1).any(dim=1).nonzero()[:, 0]
+    if not len(moved):
+        return poses
+    new = with_evidence(target, block, fitted[moved])
+    weights = target.score_weights(exact=True)
+    higher = new.evidence.scores(weights) > before.evidence.scores(weights)[moved]
+    better = (higher & block.keeps(new)).nonzero()[:, 0]
+    return poses.with_poses(index[moved[better]], new[better])

@@ -24,7 +24,7 @@ from .block import (
     keypoint_poses,
     least_starts,
     poses_of_views,
-    with_details,
+    refitted,
     with_evidence,
 )
 from .camera import (
@@ -39,7 +39,6 @@ from .confidence import are_near
 from .hypotheses import (
     Hypotheses,
     best_views,
-    close_rivals,
     common_score,
     distinct_poses,
     fit_texture_of,
@@ -477,7 +476,7 @@ def _screened(target: Target, crops: EdgeCrops, poses: Hypotheses, count: int) -
 
 def _with_keypoints(target: Target, block: Block, poses: Hypotheses) -> Hypotheses:
     """The best pose on which keypoints agree in place of the views near it."""
-    parts = [poses]
+    agreed = []
     dropped = torch.zeros(len(poses), dtype=torch.bool)
     for p, (matches, limits) in enumerate(zip(block.keypoints, block.limits, strict=True)):
         if matches is None:
@@ -489,9 +488,8 @@ def _with_keypoints(target: Target, block: Block, poses: Hypotheses) -> Hypothes
             near = are_near(poses.rotation[rows], found.rotation[0], block.symmetries)
             dropped[rows[near]] = True
             where = torch.tensor([p])
-            one = replace(found[:1], photograph=where, is_repeated=torch.tensor([True]))
-            parts.append(one)
-    return _grouped(Hypotheses.cat([poses[~dropped], *parts[1:]]))
+            agreed.append(replace(found[:1], photograph=where, is_repeated=torch.tensor([True])))
+    return _grouped(Hypotheses.cat([poses[~dropped], *agreed]))
 
 
 def _are_repeated(views: Tensor, photograph: Tensor) -> Tensor:
@@ -600,47 +598,3 @@ def _searched(target: Target, block: Block) -> list[Registration]:
         poses = block.moved_inside(poses.replaced(torch.tensor([0]), found))
         results.append(judged(target, block, p, with_evidence(target, block, poses)))
     return results
-
-
-def refitted(target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses) -> Hypotheses:
-    """Fit the best pose of each photograph again from where it is, then its close rivals: fits that
-    differ in effort cannot be compared. Results with a higher score are kept."""
-    weights = target.score_weights(exact=True)
-    best = poses.best(weights)
-    poses = _refitted(target, block, crops, poses, best)
-    scores = poses.scores(weights)
-    settings = target.pipeline.fit
-    close = []
-    different = []
-    for photograph in poses.photograph[best].tolist():
-        rows = poses.of(photograph)
-        some = poses[rows]
-        rivals = close_rivals(some, scores[rows], block.symmetries, behind=settings.close_score)
-        distinct = distinct_poses(
-            some[rivals], scores[rows][rivals], block.symmetries, angle=settings.same_pose_angle
-        )
-        close.append(rows[rivals])
-        different.append(rows[rivals[distinct][: settings.close_rivals]])
-    rivals = torch.cat(close)
-    if not len(rivals):
-        return poses
-    poses = _refitted(target, block, crops, poses, torch.cat(different))
-    return with_details(target, crops, poses, best, rivals)
-
-
-def _refitted(
-    target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses, index: Tensor
-) -> Hypotheses:
-    """Fit poses again, and keep the results that have a higher score."""
-    if not len(index):
-        return poses
-    before = poses[index]
-    fitted = fitted_poses(target, block, crops, before, refit=True)
-    moved = (before.T != fitted.T).flatten(1).any(dim=1).nonzero()[:, 0]
-    if not len(moved):
-        return poses
-    new = with_evidence(target, block, fitted[moved])
-    weights = target.score_weights(exact=True)
-    higher = new.evidence.scores(weights) > before.evidence.scores(weights)[moved]
-    better = (higher & block.keeps(new)).nonzero()[:, 0]
-    return poses.with_poses(index[moved[better]], new[better])

@@ -8,7 +8,7 @@ import torch
 
 from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.pipeline import Pipeline
-from curvireg_torch.registration import stages
+from curvireg_torch.registration import block
 from tests._support import eye
 from tests._support.hypotheses import HALF_TURN, evidence_of, poses_at
 
@@ -23,9 +23,9 @@ class Refits:
         self.new = new
         self.fitted: list[list[int]] = []
         self.compared: list[tuple[int, list[int]]] = []
-        monkeypatch.setattr(stages, "fitted_poses", self.fit)
-        monkeypatch.setattr(stages, "with_evidence", self.measure)
-        monkeypatch.setattr(stages, "with_details", self.compare)
+        monkeypatch.setattr(block, "fitted_poses", self.fit)
+        monkeypatch.setattr(block, "with_evidence", self.measure)
+        monkeypatch.setattr(block, "with_details", self.compare)
 
     def fit(self, target, block, crops, starts, *, refit):
         assert refit
@@ -48,13 +48,13 @@ class Refits:
     def run(self, poses, evidence, outside=None, symmetries=None):
         """Which poses moved, and the evidence."""
         target = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), pipeline=Pipeline())
-        block = SimpleNamespace(
+        some = SimpleNamespace(
             symmetries=symmetries, keeps=lambda poses: torch.ones(len(poses), dtype=torch.bool)
         )
         crops = None
         excluded = torch.tensor(outside or [False] * len(poses))
         before = replace(poses, evidence=evidence, is_outside=excluded)
-        after = stages.refitted(target, block, crops, before)
+        after = block.refitted(target, some, crops, before)
         return (after.T != poses.T).flatten(1).any(dim=1).tolist(), after.evidence
 
 
