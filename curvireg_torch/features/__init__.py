@@ -1,4 +1,5 @@
-"""Fields to descriptors and point masks, and networks: the learned field and the ImageNet backbone.
+"""Fields to descriptors and point masks, their whitening, and networks: the learned field and the
+ImageNet backbone.
 
 Descriptors keep the dtype (half types compute in float32). Wrong shapes, dtypes and options raise
 :class:`~curvireg_torch.errors.InvalidInputError`.
@@ -6,11 +7,13 @@ Descriptors keep the dtype (half types compute in float32). Wrong shapes, dtypes
 
 from .hog import HOG, field_points, hog
 from .learned_field import FieldNetwork, LearnedCurvilinearSaliency, doubled_angle, halved_angle
+from .whitening import Whitening
 
 __all__ = [
     "HOG",
     "FieldNetwork",
     "LearnedCurvilinearSaliency",
+    "Whitening",
     "doubled_angle",
     "field_points",
     "halved_angle",

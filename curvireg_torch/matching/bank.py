@@ -19,6 +19,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
+from ..features.whitening import Precision, Whitening, ledoit_wolf
 from ..geometry.viewpoint import ViewSphere, up_rotation
 from ..mesh import Mesh, MeshWarning, mesh_symmetries
 from ..mesh.colours import SurfaceColours
@@ -32,7 +33,7 @@ from ..mesh.mesh import (
 from ..mesh.reflections import reflection_plane
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
-from ..terms import Appearance, Precision, Whitening, ledoit_wolf
+from ..terms import Appearance
 from ..utils.checks import check_finite, check_symmetries, check_tensor
 from ..utils.files import tensor_checksum, write_tensors
 from ..utils.likes import MeshLike

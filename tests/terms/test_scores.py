@@ -2,9 +2,7 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
-import sklearn.covariance
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
@@ -12,6 +10,7 @@ from torch.testing import assert_close
 
 from curvireg_torch import ImageGradient, ViewMatcher, terms
 from curvireg_torch.features import LearnedCurvilinearSaliency
+from curvireg_torch.features.whitening import ledoit_wolf
 from tests._support import refused, scene, seeded
 
 
@@ -30,41 +29,13 @@ def test_correlation_is_the_cosine_of_the_better_crop_scored_by_standard_deviati
     assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
 
 
-def sample(count, length=12):
-    generator = seeded(count)
-    mixing = torch.randn(length, length, generator=generator)
-    return torch.randn(count, length, generator=generator) @ mixing + 3.0
-
-
-@pytest.mark.parametrize("count", [5, 30, 2000])
-def test_ledoit_wolf_equals_scikit_learn(count):
-    x = sample(count)
-    mean, covariance = terms.ledoit_wolf(x)
-    expected = sklearn.covariance.ledoit_wolf(x.double().numpy())[0]
-    np.testing.assert_allclose(covariance.numpy(), expected, rtol=1e-3, atol=1e-4)
-    assert_close(mean, x.mean(dim=0))
-
-
-@pytest.mark.parametrize("count", [5, 30, 2000])
-def test_precision_solves_with_the_shrunk_covariance(count):
-    x = sample(count, 24)
-    y = sample(7, 24)
-    mean, covariance = terms.ledoit_wolf(x)
-    precision = terms.Precision(x)
-    assert_close(precision.mean, mean)
-    expected = torch.linalg.solve(covariance.double(), y.double().T).T.float()
-    assert_close(precision(y), expected, rtol=2e-3, atol=1e-4)
-    with refused("look alike"):
-        terms.Precision(torch.ones(count, 24))
-
-
 def test_matcher_ranks_by_whitened_correlation(bank):
     images = [scene(0)[0]]
     boxes = scene(0)[1][None]
     pipeline = replace(bank.pipeline.with_term("hog", whitening="bank"), box_jitter=0.0)
     matcher = ViewMatcher(bank, pipeline=pipeline)
     query = matcher.query(images, boxes).descriptors[:, 0]
-    mean, covariance = terms.ledoit_wolf(bank.descriptors)
+    mean, covariance = ledoit_wolf(bank.descriptors)
     factor = torch.linalg.cholesky(covariance.double())
     a, b = (torch.linalg.solve(factor, (x - mean).double().T).T for x in (query, bank.descriptors))
     expected = F.cosine_similarity(a[:, None], b[None], dim=2).float()
@@ -77,7 +48,7 @@ def test_matcher_ranks_by_the_product_that_the_paper_prints(bank):
     pipeline = replace(bank.pipeline.with_term("hog", whitening="paper"), box_jitter=0.0)
     matcher = ViewMatcher(bank, pipeline=pipeline)
     query = matcher.query(images, boxes)
-    mean, covariance = terms.ledoit_wolf(bank.descriptors)
+    mean, covariance = ledoit_wolf(bank.descriptors)
     solved = torch.linalg.solve(covariance.double(), query.descriptors[0].T.double())
     expected = ((bank.descriptors - mean).double() @ solved).T.float()
     found = matcher(images, boxes).hog
@@ -164,14 +135,6 @@ def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio_away_from_the_bor
             bool((box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]])) == 1).all())
             != whole
         )
-
-
-def test_whitening_refuses_covariances_that_cannot_be_inverted():
-    x = sample(5)
-    with refused("positive definite"):
-        terms.Whitening(x.mean(dim=0), x.T.cov())
-    with refused("covariance"):
-        terms.Whitening(torch.zeros(3), torch.eye(2))
 
 
 def test_jittered_fields_are_those_of_shifted_and_scaled_boxes():
