@@ -254,7 +254,8 @@ class Rig:
         source = torch.tensor(
             [v for v, p in enumerate(self.photographs) for _ in p.result.hypotheses]
         )
-        place, (others, theirs) = self.centres(T), self.places
+        place = self.centres(T)
+        others, theirs = self.places
         own = self.precision(place, source)
         gap = (place[:, None] - others)[..., None]
         total = torch.linalg.inv(own)[:, None] + torch.linalg.inv(theirs)
@@ -345,7 +346,8 @@ class Rig:
                     <= SAME_ANGLE
                 )
                 if near and hypothesis.covariance is not None and bool(C[n].isnan().all()):
-                    T[n], C[n] = hypothesis.projection[0], hypothesis.covariance
+                    T[n] = hypothesis.projection[0]
+                    C[n] = hypothesis.covariance
         return T, C
 
     def fitted(
@@ -354,10 +356,12 @@ class Rig:
         """World poses (M, 4, 4) after a joint fit, their edge supports (V, M), and their state. If
         the fit does not improve the support of all photographs together, the initial pose is
         kept."""
-        (each, cams), V = self.tied(problem, T), len(self.photographs)
+        V = len(self.photographs)
+        each, cams = self.tied(problem, T)
         start = each.state(cams)
+        before, weighted_before = each.supports(start)
         found = each.descend(start, radii)
-        (before, weighted_before), (after, weighted) = each.supports(start), each.supports(found)
+        after, weighted = each.supports(found)
         better = (each.summed(weighted) > each.summed(weighted_before))[each.group]
         state = ContourState.cat([start, found])[torch.arange(len(cams)) + len(cams) * better]
         support = torch.where(better, after, before).view(len(T), V).T

@@ -154,7 +154,9 @@ def _paste_tiles(
 ) -> None:
     """Paste pictures into a grid of cells of ``size`` (W, H), each with its caption below, ``line``
     px high."""
-    draw, font, (W, H) = ImageDraw.Draw(sheet), ImageFont.load_default(line), size
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(line)
+    W, H = size
     for k, (caption, picture) in enumerate(tiles):
         x = corner[0] + k % columns * (W + GAP)
         y = corner[1] + k // columns * (H + 2 * line + GAP)
