@@ -6,6 +6,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from .alignment import surface_points
 from .mesh import measure, mesh_radius, principal_rotation
 
 # Points of a surface that are reflected, and the distance from it, as a fraction of its radius,
@@ -26,8 +27,8 @@ def reflection_plane(mesh: trimesh.Trimesh) -> Tensor | None:
         True
     """
     centre = np.asarray(mesh.centroid)
-    points = trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0] - centre
-    tree = cKDTree(trimesh.sample.sample_surface(mesh, 20 * POINTS, seed=1)[0] - centre)
+    points = surface_points(mesh, POINTS) - centre
+    tree = cKDTree(surface_points(mesh, 20 * POINTS, seed=1) - centre)
     normals = np.concatenate([principal_rotation(mesh).numpy(), np.eye(3)])
     means = []
     for normal in normals:

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..geometry import rotation_from_axis_angle
+from .alignment import are_near, axis_of, rigid_step, surface_points
 from .mesh import measure, mesh_radius
 
 # Points of the surface that are compared with, and those that are turned
@@ -53,7 +54,7 @@ def round_axis(mesh: trimesh.Trimesh) -> RoundAxis | None:
         True
     """
     radius = mesh_radius(mesh)
-    cloud = np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0])
+    cloud = surface_points(mesh, POINTS)
     start = cloud.mean(axis=0)
     cloud = (cloud - start) / radius
     candidates = _candidates(cloud)
@@ -102,9 +103,7 @@ def _turn(direction: np.ndarray, angle: float) -> np.ndarray:
 
 def _landing(tree: cKDTree, points: np.ndarray, R: np.ndarray, centre: np.ndarray) -> float:
     """Fraction of points that land on the surface when they turn about a centre."""
-    moved = (points - centre) @ R.T + centre
-    distance, _ = tree.query(moved, distance_upper_bound=TOLERANCE)
-    return float(np.isfinite(distance).mean())
+    return float(are_near(tree, (points - centre) @ R.T + centre, TOLERANCE).mean())
 
 
 def _aligned(
@@ -116,24 +115,12 @@ def _aligned(
     shift = np.zeros(3)
     weight = np.zeros((3, 3))
     for angle in ANGLES:
-        R = _turn(direction, angle)
-        moved = (points - centre) @ R.T + centre
-        distance, nearest = tree.query(moved)
-        near = distance <= np.quantile(distance, TRUSTED)
-        source = points[near]
-        target = tree.data[nearest[near]]
-        from_mean = source.mean(axis=0)
-        to_mean = target.mean(axis=0)
-        U, _, V = np.linalg.svd((source - from_mean).T @ (target - to_mean))
-        V[2] *= np.sign(np.linalg.det(U @ V))
-        best = (U @ V).T
-        t = to_mean - best @ from_mean
-        # the axis is what the motion leaves in place
-        vectors, _, _ = np.linalg.svd(np.eye(3) - best.T)
-        axis = vectors[:, 2]
-        directions.append(axis * np.sign(axis @ direction))
+        moved = (points - centre) @ _turn(direction, angle).T + centre
+        R, t, _ = rigid_step(tree, points, moved, TRUSTED)
+        axis, point = axis_of(R, t, direction)
+        directions.append(axis)
         across = np.eye(3) - np.outer(axis, axis)
         weight += across
-        shift += across @ (np.linalg.pinv(np.eye(3) - best, rcond=1e-3) @ t)
+        shift += across @ point
     mean = np.mean(directions, axis=0)
     return mean / np.linalg.norm(mean), np.linalg.pinv(weight, rcond=1e-3) @ shift

@@ -7,11 +7,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..geometry import rotation_from_axis_angle
+from ..utils.arrays import Floats
+from .alignment import are_near, axis_of, rigid_step, surface_points
 from .mesh import measure, mesh_radius
 
 # Random points of the surface, and how many of them are compared with all
@@ -65,9 +66,7 @@ def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
     """
     centre = np.array(mesh.centroid, dtype=np.float64)
     radius = mesh_radius(mesh)
-    surface = _Surface(
-        (np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0]) - centre) / radius
-    )
+    surface = _Surface((surface_points(mesh, POINTS) - centre) / radius)
     revolutions: list[_Line] = []
     turns: list[tuple[_Line, float]] = []
     for axis in _axes(surface.cloud):
@@ -106,14 +105,14 @@ def feature_fractions(mesh: trimesh.Trimesh, symmetries: Tensor) -> Tensor:
         >>> feature_fractions(box, mesh_symmetries(box)).tolist()
         [0.0, 0.0, 0.0, 0.0]
     """
-    cloud = np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0])
+    cloud = surface_points(mesh, POINTS)
     tree = cKDTree(cloud)
     some = cloud[:: POINTS // FEATURE_POINTS]
     tolerance = FEATURE_HEIGHT * mesh_radius(mesh)
-    fractions = []
-    for S in symmetries.double().numpy():
-        distance, _ = tree.query(some @ S[:3, :3].T + S[:3, 3], distance_upper_bound=tolerance)
-        fractions.append(float(np.isinf(distance).mean()))
+    fractions = [
+        float((~are_near(tree, some @ S[:3, :3].T + S[:3, 3], tolerance)).mean())
+        for S in symmetries.double().numpy()
+    ]
     return torch.tensor(fractions, dtype=torch.float64)
 
 
@@ -143,7 +142,7 @@ def _common_point(lines: Sequence[_Line]) -> Tensor:
 class _Surface:
     """Points (N, 3) of a surface whose radius is 1, near the origin."""
 
-    def __init__(self, cloud: NDArray[np.float64]) -> None:
+    def __init__(self, cloud: Floats) -> None:
         self.cloud = cloud
         self._tree = cKDTree(cloud)
         self._some = cloud[:: POINTS // TESTED]
@@ -155,31 +154,17 @@ class _Surface:
         t = np.zeros(3)
         points = self._some[:: TESTED // ALIGNED_POINTS]
         for _ in range(ALIGNMENT_STEPS):
-            distance, nearest = self._tree.query(points @ R.T + t)
-            near = distance <= np.quantile(distance, ALIGNED_FRACTION)
-            if distance[near].mean() > NEAR_SYMMETRY:
+            R, t, apart = rigid_step(self._tree, points, points @ R.T + t, ALIGNED_FRACTION)
+            if apart > NEAR_SYMMETRY:
                 return None
-            source = points[near]
-            target = self.cloud[nearest[near]]
-            U, _, V = np.linalg.svd(
-                (source - source.mean(axis=0)).T @ (target - target.mean(axis=0))
-            )
-            V[2] *= np.sign(np.linalg.det(U @ V))
-            R = (U @ V).T
-            t = target.mean(axis=0) - R @ source.mean(axis=0)
         if np.trace(R @ start.T) < 1.0 + 2.0 * math.cos(math.radians(MAX_TILT)):
             return None
-        distance, _ = self._tree.query(self._some @ R.T + t, distance_upper_bound=TOLERANCE)
-        if float(np.isfinite(distance).mean()) < FRACTION:
+        if are_near(self._tree, self._some @ R.T + t, TOLERANCE).mean() < FRACTION:
             return None
-        # The axis is what R leaves in place; the point on it nearest to the origin solves (1 - R) x
-        # = t across it.
-        vectors, _, _ = np.linalg.svd(np.eye(3) - R.T)
-        found = torch.from_numpy(vectors[:, 2] * np.sign(vectors[:, 2] @ axis.numpy()))
-        return _Line(found, torch.from_numpy(np.linalg.pinv(np.eye(3) - R, rcond=1e-3) @ t))
+        return _Line(*map(torch.from_numpy, axis_of(R, t, axis.numpy())))
 
 
-def _axes(cloud: NDArray[np.float64]) -> list[Tensor]:
+def _axes(cloud: Floats) -> list[Tensor]:
     """Unit axes of the file, and the principal axes of the surface that are well defined and differ
     from them."""
     moments, vectors = np.linalg.eigh(cloud.T @ cloud)
