@@ -43,15 +43,12 @@ class MeshEdges:
         order = np.argsort(edge, kind="stable")
         first = np.searchsorted(edge[order], np.arange(len(self.edges)))
         count = np.bincount(edge, minlength=len(self.edges))
-        slot = first[:, None] + np.minimum(np.arange(MAX_EDGE_FACES), count[:, None] - 1)
-        # (E, 4), the last one repeated
-        self._edge_faces = owner[order][slot]
-        signs = sign[order][slot]
         # closed meshes have two faces at every edge
         depth = min(MAX_EDGE_FACES, max(2, int(count.max(initial=1))))
-        self._edge_faces = self._edge_faces[:, :depth]
-        signs = signs[:, :depth]
-        self._flips = (signs < 0).T
+        slot = first[:, None] + np.minimum(np.arange(depth), count[:, None] - 1)
+        # (E, depth), the last one repeated
+        self._edge_faces = owner[order][slot]
+        self._signs = signs = sign[order][slot]
         boundary = count == 1
         many = count > 2
         # Unit vectors within the faces, away from the edge: they do not depend on the orientation
@@ -75,8 +72,7 @@ class MeshEdges:
         looks at them: n . x + d has the sign of ((a - x) x (b - x)) . corner, with the ends a and b
         of the edge and the third corner of the face, seen from x relative to ``centre``."""
         planes = np.concatenate([-self._plane, self._offset[:, None]], axis=1)
-        signs = np.where(self._flips, -1.0, 1.0)
-        oriented: np.ndarray = signs[..., None] * planes[self._edge_faces.T]
+        oriented: np.ndarray = self._signs.T[..., None] * planes[self._edge_faces.T]
         return oriented
 
 
@@ -104,19 +100,12 @@ def encloses_volumes(mesh: trimesh.Trimesh) -> bool:
         np.round(vertices / max(np.ptp(vertices, axis=0).max() * WELD, 1e-300)).astype(np.int64)
     )
     corners = number[faces]
-    ends = np.roll(corners, -1, axis=1)
-    has_area = (corners != ends).all(axis=1)
-    corners = corners[has_area]
-    ends = ends[has_area]
-    a = corners.ravel()
-    b = ends.ravel()
-    along = np.sort(a * len(vertices) + b)
-    back = np.sort(b * len(vertices) + a)
-    if not len(along) or (along != back).any() or not (np.diff(along) > 0).all():
+    has_area = (corners != np.roll(corners, -1, axis=1)).all(axis=1)
+    welded = trimesh.Trimesh(vertices, corners[has_area], process=False)
+    if not (has_area.any() and welded.is_watertight and welded.is_winding_consistent):
         return False
-    body = trimesh.graph.connected_component_labels(
-        np.column_stack([a, b]), node_count=len(vertices)
-    )[corners[:, 0]]
+    label = trimesh.graph.connected_component_labels(welded.edges, node_count=len(vertices))
+    body = label[welded.faces[:, 0]]
     volume = np.bincount(body, np.linalg.det(vertices[faces[has_area]] - vertices.mean(axis=0)))
     return bool((volume[np.unique(body)] > 0).all())
 
