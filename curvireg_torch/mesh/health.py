@@ -3,11 +3,10 @@ digits."""
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from ..formats.meshes.source import MeshWarning
+from ..utils.arrays import Flags, Floats, Indices, Integers
 
 SAMPLES = 20_000  # Points of the surface that say where it is
 # Parts that together hold less than this fraction of the surface, and lie farther from the rest
@@ -21,7 +20,7 @@ SPREAD = 1.15
 COARSE_STEP = 2e-4
 
 
-def stray_faces(mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
+def stray_faces(mesh: trimesh.Trimesh) -> Flags:
     """(F,): which faces belong to parts of almost no area that lie apart from the rest and enlarge
     the mesh's box.
 
@@ -51,7 +50,7 @@ def stray_faces(mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
     return np.asarray(stray & ~part_inside[part])
 
 
-def stray_warning(mesh: trimesh.Trimesh, stray: NDArray[np.bool_]) -> MeshWarning:
+def stray_warning(mesh: trimesh.Trimesh, stray: Flags) -> MeshWarning:
     """What was left out of a mesh, and where it lies."""
     count = int(stray.sum())
     area = np.asarray(mesh.area_faces)
@@ -79,36 +78,26 @@ def precision_warning(mesh: trimesh.Trimesh) -> MeshWarning | None:
     return MeshWarning("precision", text)
 
 
-def _random_faces(area: NDArray[np.float64]) -> NDArray[np.int64]:
+def _random_faces(area: Floats) -> Integers:
     """(N,) faces, more often the larger ones; always the same."""
     total = np.cumsum(area)
     places = (np.arange(SAMPLES) + 0.5) / SAMPLES * total[-1]
     return np.asarray(np.searchsorted(total, places).clip(max=len(area) - 1))
 
 
-def _random_points(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def _random_points(corners: Floats) -> Floats:
     """(N, 3) points within N triangles."""
     weights = np.random.default_rng(0).dirichlet(np.ones(3), len(corners))
     return np.asarray(np.einsum("nk,nkj->nj", weights, corners))
 
 
-def _parts(cells: NDArray[np.int64], face: NDArray[np.int64], count: int) -> NDArray[np.int32]:
+def _parts(cells: Integers, face: Integers, count: int) -> Indices:
     """(F,) numbers of the parts that the faces belong to; ``cells`` are those of the samples, which
     are of ``face``, and then of the three corners of each of the ``count`` faces."""
-    key = (cells + 2**19) @ np.array([2**40, 2**20, 1])
-    unique, place = np.unique(key, return_inverse=True)
-    links = []
-    shifts = np.stack(
-        np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1
-    ).reshape(-1, 3)
-    for shift in shifts[:13]:  # the others are their opposites
-        wanted = unique + shift @ np.array([2**40, 2**20, 1])
-        found = np.searchsorted(unique, wanted).clip(max=len(unique) - 1)
-        near = (unique[found] == wanted).nonzero()[0]
-        links.append(np.column_stack([near, found[near]]))
+    unique, place = trimesh.grouping.unique_rows(cells)
+    near = cKDTree(cells[unique]).query_pairs(1.0, p=np.inf, output_type="ndarray")
     corners = place[SAMPLES:].reshape(count, 3)
-    links += [corners[:, :2], corners[:, 1:], np.column_stack([place[:SAMPLES], corners[face, 0]])]
-    pairs = np.concatenate(links)
-    graph = coo_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(unique),) * 2)
-    _, label = connected_components(graph, directed=False)
+    samples = np.column_stack([place[:SAMPLES], corners[face, 0]])
+    links = np.concatenate([near, corners[:, :2], corners[:, 1:], samples])
+    label = trimesh.graph.connected_component_labels(links, node_count=len(unique))
     return np.asarray(label[corners[:, 0]], np.int32)
