@@ -2,12 +2,13 @@
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
+from ..utils.aliases import Document, Fields
 from ..utils.checks import check_positive
 
 
@@ -84,7 +85,7 @@ class FunctionModule(nn.Module):
     def __init__(self, learnable: tuple[str, ...] = (), **options: Any) -> None:
         super().__init__()
         self._names = tuple(options)
-        self._fixed: dict[str, Any] = {}
+        self._fixed: Fields = {}
         for name, value in options.items():
             if name in learnable:
                 start = value if isinstance(value, Tensor) else check_positive(value, name)
@@ -98,7 +99,7 @@ class FunctionModule(nn.Module):
                 setattr(self, name, tuple(value) if isinstance(value, list) else value)
 
     @property
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Fields:
         """The present values, as keyword arguments of the function."""
         return {name: getattr(self, name) for name in self._names}
 
@@ -116,7 +117,7 @@ class FunctionModule(nn.Module):
 
     def _load_from_state_dict(
         self,
-        state_dict: Mapping[str, Any],
+        state_dict: Document,
         prefix: str,
         local_metadata: Any,
         strict: bool,

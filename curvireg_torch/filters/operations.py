@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import CurviregWarning, InvalidInputError
+from ..utils.aliases import Fields, Size
 from ..utils.checks import check_colour_image, check_positive, check_tensor
 from ..utils.precision import exact_convolutions
 
@@ -416,11 +417,11 @@ def is_directional_maximum(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return result
 
 
-def resized(image: Tensor, size: tuple[int, int], *, mode: str = "bilinear") -> Tensor:
+def resized(image: Tensor, size: Size, *, mode: str = "bilinear") -> Tensor:
     """(C, h, w) float32 in about [0, 1] of a photograph (C, H, W), floating in [0, 1] or uint8."""
     if tuple(image.shape[-2:]) == size and image.is_floating_point():
         return image.float()
-    options: dict[str, Any] = {
+    options: Fields = {
         "size": size,
         "mode": mode,
         "antialias": True,

@@ -6,9 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, fields, replace
 from functools import cached_property
-from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -34,6 +32,7 @@ from ..mesh.reflections import reflection_plane
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
 from ..terms import Appearance
+from ..utils.aliases import Fields, PathName
 from ..utils.checks import check_finite, check_symmetries, check_tensor
 from ..utils.files import tensor_checksum, write_tensors
 from ..utils.likes import MeshLike
@@ -209,7 +208,7 @@ class ViewBank:
         mesh = as_mesh(mesh)
         pipeline = pipeline or Pipeline()
         given = {"image_size": image_size, "camera": camera}
-        changed: dict[str, Any] = {k: v for k, v in given.items() if v is not None}
+        changed: Fields = {k: v for k, v in given.items() if v is not None}
         pipeline = replace(pipeline, bank=replace(pipeline.bank, **changed))
         if views is None:
             views = views_of(mesh, pipeline.views)
@@ -270,7 +269,7 @@ class ViewBank:
             **({} if self.appearance is None else {"appearance": self.appearance}),
         }
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: PathName) -> None:
         """Write a safetensors file atomically. Descriptors in float16 change cosines by less than
         1e-4."""
         contents = {**self.tensors, "descriptors": self.descriptors.half()}
@@ -314,7 +313,7 @@ class ViewBank:
         return angles[0] if angles else None
 
     @classmethod
-    def load(cls, path: str | PathLike[str], *, device: torch.device | str = "cpu") -> "ViewBank":
+    def load(cls, path: PathName, *, device: torch.device | str = "cpu") -> "ViewBank":
         """Read a bank written by :meth:`save`.
 
         Raises:

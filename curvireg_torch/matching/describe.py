@@ -17,6 +17,7 @@ from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
 from ..rendering.contours import LEVELS, MeshContours
 from ..rendering.zbuffer import DeviceRenderer
+from ..utils.aliases import Size
 from ..utils.likes import MeshLike
 
 VIEWS_AT_A_TIME = 64  # Views in memory at a time
@@ -203,7 +204,7 @@ class ViewDescriber:
         """Whether the mesh has colours, and :meth:`draw` can show them."""
         return self._mesh.has_colours and hasattr(self.renderer, "faces_at")
 
-    def draw(self, T: Tensor, K: Tensor, size: tuple[int, int], supersampling: int = 2) -> Tensor:
+    def draw(self, T: Tensor, K: Tensor, size: Size, supersampling: int = 2) -> Tensor:
         """(N, 3, H, W) of :func:`curvireg_torch.rendering.render_colour`."""
         return render_colour(
             self._mesh, T, K, size, renderer=self.renderer, supersampling=supersampling

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -28,6 +28,7 @@ from ..terms import (
     photograph_field,
     whole_box_shapes,
 )
+from ..utils.aliases import Fields
 from ..utils.checks import as_boxes, check_pixels
 from ..utils.computed import without_computed
 from ..utils.files import text_digest
@@ -207,11 +208,11 @@ class ViewMatcher(nn.Module):
             self._prepare_on_one_thread()
         return self
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Fields:
         """Without what is computed from the rest: comparisons and renderers cannot be pickled."""
         return without_computed(self)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Fields) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
         self._prepare_on_one_thread()
 

@@ -2,10 +2,10 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..formats.meshes.colours import SurfaceColours as SurfaceColours
 from ..formats.meshes.colours import colours_of_parts as colours_of_parts
+from ..utils.arrays import Bytes, Floats, Indices, Singles
 
 SAMPLES = 20_000  # Points of the surface at which colours are compared
 # Colours vary if so large a fraction of the surface differs by so much, of 255, from the median: a
@@ -15,7 +15,7 @@ VARIED_BY = 12
 ROW = 1024  # Samples in a row of the map that OpenCV is given, whose sides are limited
 
 
-def colours_vary(colours: SurfaceColours, areas: NDArray[np.float64]) -> bool:
+def colours_vary(colours: SurfaceColours, areas: Floats) -> bool:
     """Whether colours differ over the surface, whose faces have some areas (F,)."""
     corners = colours.corners.reshape(-1, 3)
     if not len(corners) or (not colours.textures and (corners == corners[0]).all()):
@@ -38,16 +38,14 @@ def colours_vary(colours: SurfaceColours, areas: NDArray[np.float64]) -> bool:
 
 def colours_at(
     colours: SurfaceColours,
-    face: NDArray[np.int32],
-    u: NDArray[np.float32],
-    v: NDArray[np.float32],
-) -> NDArray[np.float32]:
+    face: Indices,
+    u: Singles,
+    v: Singles,
+) -> Singles:
     """(N, 3) RGB in [0, 1] at the points (1 - u - v) a + u b + v c of faces with corners a, b,
     c."""
     weights = np.stack([1.0 - u - v, u, v], axis=1).astype(np.float32)
-    colour: NDArray[np.float32] = np.einsum(
-        "ij,ijk->ik", weights, colours.corners[face].astype(np.float32)
-    )
+    colour: Singles = np.einsum("ij,ijk->ik", weights, colours.corners[face].astype(np.float32))
     colour /= np.float32(255)
     uv = np.einsum("ij,ijk->ik", weights, colours.uv[face])
     texture = colours.texture[face]
@@ -57,7 +55,7 @@ def colours_at(
     return colour
 
 
-def _sample(texture: NDArray[np.uint8], uv: NDArray[np.float32]) -> NDArray[np.float32]:
+def _sample(texture: Bytes, uv: Singles) -> Singles:
     """(N, 3) in [0, 1]: bilinear, repeating."""
     (h, w), count = texture.shape[:2], len(uv)
     places = np.zeros((2, -(-count // ROW) * ROW), np.float32)

@@ -13,7 +13,6 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import (
@@ -26,6 +25,8 @@ from ..errors import (
 from ..formats.meshes.files import read_mesh
 from ..formats.meshes.scenes import joined_scene
 from ..formats.meshes.source import MeshWarning
+from ..utils.aliases import Fields, PathName
+from ..utils.arrays import Flags, Floats, Integers
 from ..utils.checks import check_option
 from ..utils.choices import UNITS, UP_AXES
 from ..utils.likes import MeshLike
@@ -64,7 +65,7 @@ class Mesh:
     colours: SurfaceColours | None = None
     warnings: tuple[MeshWarning, ...] = ()
     file_name: str = ""
-    measures: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+    measures: Fields = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.unit is not None:
@@ -72,22 +73,22 @@ class Mesh:
         check_option(self.up, UP_AXES, "up")
 
     @property
-    def vertices(self) -> NDArray[np.float64]:
+    def vertices(self) -> Floats:
         """(V, 3)."""
         return np.asarray(self.surface.vertices)
 
     @property
-    def faces(self) -> NDArray[np.int64]:
+    def faces(self) -> Integers:
         """(F, 3) indices of vertices."""
         return np.asarray(self.surface.faces)
 
     @property
-    def bounds(self) -> NDArray[np.float64]:
+    def bounds(self) -> Floats:
         """(2, 3) lowest and highest coordinates."""
         return np.asarray(self.surface.bounds)
 
     @property
-    def extents(self) -> NDArray[np.float64]:
+    def extents(self) -> Floats:
         """(3,) sides of the axis-aligned box."""
         return np.asarray(self.surface.extents)
 
@@ -99,12 +100,12 @@ class Mesh:
 
 
 def load_mesh(
-    path: str | PathLike[str],
+    path: PathName,
     *,
     unit: str | None = None,
     up: str | None = None,
     link: str | None = None,
-    textures: str | PathLike[str] | None = None,
+    textures: PathName | None = None,
 ) -> Mesh:
     """Read a mesh file; scenes become one mesh, polygons become triangles, normals are ignored.
 
@@ -259,9 +260,7 @@ def _why_no_faces(source: object, noticed: Sequence[MeshWarning]) -> str:
 MANY_POINTS = 4096
 
 
-def checked_triangles(
-    mesh: trimesh.Trimesh, name: str
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[Integers, Flags]:
     """(F, 3) faces, and (F,) whether a face has no area; :class:`MeshError` for triangles that are
     no mesh."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64)

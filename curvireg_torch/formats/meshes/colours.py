@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL.Image import Resampling
 
 from ...errors import MAX_IMAGE_PIXELS, MAX_TEXTURE_PIXELS
-from ...utils.arrays import Bytes, Floats, Singles
+from ...utils.arrays import Array, Bytes, Floats, Indices, Singles
 from ...utils.pictures import PICTURE_STARTS, open_picture
 from ...utils.srgb import srgb
 
@@ -41,7 +40,7 @@ class SurfaceColours:
 
     corners: Bytes
     uv: Singles
-    texture: NDArray[np.int32]
+    texture: Indices
     textures: tuple[Bytes, ...] = ()
 
     def __len__(self) -> int:
@@ -56,7 +55,7 @@ class SurfaceColours:
     def check(self, faces: int) -> None:
         """Raise ValueError unless these are valid colours of ``faces`` faces."""
 
-        def fits(x: NDArray[Any], shape: tuple[int, ...], dtype: type) -> bool:
+        def fits(x: Array, shape: tuple[int, ...], dtype: type) -> bool:
             return x.shape == shape and x.dtype == dtype
 
         is_valid = (

@@ -18,12 +18,13 @@ from pxr import Ar, Sdf, Usd, UsdGeom, UsdShade
 MAX_PRIMS_PER_PART = 20  # groups, materials and lights beside the parts
 MAX_LAYERS = 1000
 DAMAGED = "not a USD file, or damaged"
+Fields = dict[str, Any]
 COLOUR_NAMES = ("diffuseColor", "baseColor", "base_color")
 
 
 def main() -> None:
     path, out, most_parts, most_faces = sys.argv[1:]
-    arrays: dict[str, Any] = {}
+    arrays: Fields = {}
     try:
         layers = _used_layers(path)
         about = {**read(path, arrays, int(most_parts), int(most_faces)), "layers": layers}
@@ -82,7 +83,7 @@ def _refuse_clips(layer: Any) -> Any:
     return visit
 
 
-def read(path: str, arrays: dict[str, Any], most_parts: int, most_faces: int) -> dict[str, Any]:
+def read(path: str, arrays: Fields, most_parts: int, most_faces: int) -> Fields:
     """Unit, axis and parts of a stage at its first frame."""
     stage = Usd.Stage.Open(path)
     if stage is None:
@@ -90,7 +91,7 @@ def read(path: str, arrays: dict[str, Any], most_parts: int, most_faces: int) ->
     metres = None
     if UsdGeom.StageHasAuthoredMetersPerUnit(stage):
         metres = float(UsdGeom.GetStageMetersPerUnit(stage))
-    parts: list[dict[str, Any]] = []
+    parts: list[Fields] = []
     left_out: set[str] = set()
     places = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
     faces = 0
@@ -126,7 +127,7 @@ def is_hidden(prim: Any) -> bool:
     return is_helper or _first_value(image.GetVisibilityAttr()) == UsdGeom.Tokens.invisible
 
 
-def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | None:
+def read_mesh(mesh: Any, key: str, arrays: Fields) -> Fields | None:
     """A mesh: its arrays, and what is known of its materials; None without faces."""
     points = _array(mesh.GetPointsAttr(), np.float64).reshape(-1, 3)
     counts = _array(mesh.GetFaceVertexCountsAttr())
@@ -144,7 +145,7 @@ def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | N
     colour = _by_corner(UsdGeom.Gprim(mesh).GetDisplayColorPrimvar(), counts, indices)
     if colour is not None:
         arrays[key + "colour"] = colour.reshape(-1, 3)
-    materials: list[dict[str, Any]] = []
+    materials: list[Fields] = []
     of_face = np.zeros(len(counts), np.int64)
     prim = mesh.GetPrim()
     subsets = UsdGeom.Subset.GetAllGeomSubsets(mesh)
@@ -196,7 +197,7 @@ def _by_corner(primvar: Any, counts: Any, indices: Any) -> Any:
     return None if index is None or index.max(initial=0) >= len(values) else values[index]
 
 
-def _surface_of(material: Any) -> dict[str, Any]:
+def _surface_of(material: Any) -> Fields:
     """The colour of a material, linear, or its texture and the name of its coordinates."""
     shader = material.ComputeSurfaceSource()[0]
     if not shader:
@@ -213,7 +214,7 @@ def _surface_of(material: Any) -> dict[str, Any]:
     return {}
 
 
-def texture_of(shader: Any) -> dict[str, Any]:
+def texture_of(shader: Any) -> Fields:
     """The file of a texture, the factors of its colours, and the primvar of its coordinates."""
     file = value_of(shader.GetInput("file")) if shader else None
     asset = _first_value(file)
