@@ -8,6 +8,8 @@ import torch.nn.functional as F
 import trimesh
 from torch import Tensor
 
+from ..utils.arrays import Floats, Integers, Singles
+
 WELD = 1e-6  # Vertices nearer than this fraction of the mesh's longest side are one
 CREASE_ANGLE = 15.0  # Degrees between two faces from which their common edge is a crease
 # Degrees between two faces below which the surface counts as smooth across their edge
@@ -29,7 +31,7 @@ class MeshEdges:
         is_crease, is_smooth: (E,) bool.
     """
 
-    def __init__(self, mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> None:
+    def __init__(self, mesh: trimesh.Trimesh, centre: Floats, max_faces: int) -> None:
         self.vertices, self.faces = vertices, faces = simplified(mesh, centre, max_faces)
         a, b, c = (vertices[faces[:, k]] for k in range(3))
         self._plane = np.cross(b - a, c - a)  # length: twice the area
@@ -65,15 +67,14 @@ class MeshEdges:
         for k in range(3):
             np.add.at(total, faces[:, k], self._plane)
         normals = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
-        self.normals: np.ndarray = normals.astype(np.float32)
+        self.normals: Singles = normals.astype(np.float32)
 
-    def side_planes(self) -> np.ndarray:
+    def side_planes(self) -> Floats:
         """(k, E, 4) float64 planes (n, d) of the faces of each edge, as :func:`occluding_edges`
         looks at them: n . x + d has the sign of ((a - x) x (b - x)) . corner, with the ends a and b
         of the edge and the third corner of the face, seen from x relative to ``centre``."""
         planes = np.concatenate([-self._plane, self._offset[:, None]], axis=1)
-        oriented: np.ndarray = self._signs.T[..., None] * planes[self._edge_faces.T]
-        return oriented
+        return np.asarray(self._signs.T[..., None] * planes[self._edge_faces.T])
 
 
 def occluding_edges(side_planes: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
@@ -110,9 +111,7 @@ def encloses_volumes(mesh: trimesh.Trimesh) -> bool:
     return bool((volume[np.unique(body)] > 0).all())
 
 
-def simplified(
-    mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int
-) -> tuple[np.ndarray, np.ndarray]:
+def simplified(mesh: trimesh.Trimesh, centre: Floats, max_faces: int) -> tuple[Floats, Integers]:
     """Vertices (V, 3) float64 relative to ``centre`` and faces (F, 3) of a mesh, welded, F at most
     about ``max_faces``."""
     vertices, faces = _welded(
@@ -126,7 +125,7 @@ def simplified(
     return _welded(points.astype(np.float64), triangles)
 
 
-def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _welded(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
     """Vertices at the same place joined, and each triangle once, without those of no area."""
     cell = np.ptp(vertices, axis=0).max() * WELD
     index, inverse = _unique(np.round(vertices / cell).astype(np.int64))
@@ -141,7 +140,7 @@ def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return vertices, faces[np.sort(first)]
 
 
-def _unique(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _unique(rows: Integers) -> tuple[Integers, Integers]:
     """Indices of the distinct rows of whole numbers (N, K), in lexical order, so that edges of one
     vertex are neighbours, and the number of each row among them; much faster than ``np.unique``
     with an axis."""

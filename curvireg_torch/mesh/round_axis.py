@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..geometry import rotation_from_axis_angle
+from ..utils.arrays import Floats
 from .alignment import are_near, axis_of, rigid_step, surface_points
 from .mesh import measure, mesh_radius
 
@@ -83,7 +84,7 @@ def round_axis(mesh: trimesh.Trimesh) -> RoundAxis | None:
     )
 
 
-def _candidates(cloud: np.ndarray) -> list[np.ndarray]:
+def _candidates(cloud: Floats) -> list[Floats]:
     """Unit vectors (3,) about which a shape may be round: the principal axis across which the
     moments are nearly equal; where all are, the axes of the file."""
     moments, vectors = np.linalg.eigh(cloud.T @ cloud)
@@ -96,19 +97,18 @@ def _candidates(cloud: np.ndarray) -> list[np.ndarray]:
     return [direction * np.sign(direction[np.argmax(np.abs(direction))])]
 
 
-def _turn(direction: np.ndarray, angle: float) -> np.ndarray:
-    R: np.ndarray = rotation_from_axis_angle(angle * torch.from_numpy(direction)).numpy()
-    return R
+def _turn(direction: Floats, angle: float) -> Floats:
+    return rotation_from_axis_angle(angle * torch.from_numpy(direction)).numpy()
 
 
-def _landing(tree: cKDTree, points: np.ndarray, R: np.ndarray, centre: np.ndarray) -> float:
+def _landing(tree: cKDTree, points: Floats, R: Floats, centre: Floats) -> float:
     """Fraction of points that land on the surface when they turn about a centre."""
     return float(are_near(tree, (points - centre) @ R.T + centre, TOLERANCE).mean())
 
 
 def _aligned(
-    tree: cKDTree, points: np.ndarray, direction: np.ndarray, centre: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    tree: cKDTree, points: Floats, direction: Floats, centre: Floats
+) -> tuple[Floats, Floats]:
     """The axis after a step that brings the turned points nearer to the surface: what a rigid
     motion that does so leaves in place, for each of the angles, and their mean."""
     directions = []

@@ -14,6 +14,7 @@ from ..geometry.cameras import boxes_around, projected
 from ..geometry.crops import crop_transforms, square_boxes
 from ..matching import ViewDescriber
 from ..rendering.contours import LEVELS
+from ..utils.arrays import Bytes, Flags, Floats, Singles
 from .encoding import rescaled, to_uint8
 
 OUTLINE = (0, 255, 80)
@@ -62,7 +63,7 @@ def close_up(size: Sequence[int], box: Sequence[float]) -> tuple[int, int, int, 
 
 def draw_close_up(
     image: Tensor, box: Sequence[float], side: float, objects: Sequence[Drawn]
-) -> np.ndarray:
+) -> Bytes:
     """:func:`draw_window` around a box, at most ``side`` px wide and high."""
     window = close_up(image.shape[-2:], box)
     x0, y0, x1, y1 = window
@@ -71,7 +72,7 @@ def draw_close_up(
 
 def draw_window(
     image: Tensor, window: Sequence[int], scale: float, objects: Sequence[Drawn]
-) -> np.ndarray:
+) -> Bytes:
     """(H', W', 3) uint8 RGB: part of a (1 or 3, H, W) photograph with the contours of objects.
 
     ``window`` is x0, y0, x1, y1 without the last column and row, and is resized by ``scale``.
@@ -97,7 +98,7 @@ def draw_window(
     return picture
 
 
-def _draw_axis(picture: np.ndarray, ends: Tensor, T: Tensor, K: Tensor) -> None:
+def _draw_axis(picture: Bytes, ends: Tensor, T: Tensor, K: Tensor) -> None:
     """Draw an arrow between ``ends`` (2, 3) of the model; ``K`` (3, 3) has px of the picture."""
     if float((ends @ T[2, :3] + T[2, 3]).min()) > 0.0:
         arrow = partial(cv2.arrowedLine, line_type=cv2.LINE_AA, tipLength=0.08)
@@ -107,7 +108,7 @@ def _draw_axis(picture: np.ndarray, ends: Tensor, T: Tensor, K: Tensor) -> None:
 
 def _draw_rimmed(
     draw: Callable[..., object],
-    picture: np.ndarray,
+    picture: Bytes,
     ends: Tensor,
     colour: tuple[int, int, int],
     thickness: float,
@@ -119,7 +120,7 @@ def _draw_rimmed(
     draw(picture, start, end, colour, width)
 
 
-def _paint(picture: np.ndarray, layer: np.ndarray) -> None:
+def _paint(picture: Bytes, layer: Bytes) -> None:
     """Paint an (H, W, 4) layer over an (H, W, 3) picture."""
     is_drawn = layer[..., 3] > 0
     alpha = layer[is_drawn][:, 3:] / 255.0
@@ -127,9 +128,7 @@ def _paint(picture: np.ndarray, layer: np.ndarray) -> None:
     picture[is_drawn] = np.round(alpha * paint + (1.0 - alpha) * picture[is_drawn])
 
 
-def contour_layer(
-    describer: ViewDescriber, T: Tensor, K: Tensor, size: Sequence[int]
-) -> np.ndarray:
+def contour_layer(describer: ViewDescriber, T: Tensor, K: Tensor, size: Sequence[int]) -> Bytes:
     """Outline (green), inner occluding edges and creases (orange) of a mesh at a pose, on a
     transparent layer.
 
@@ -170,7 +169,7 @@ def contour_layer(
 
 def contour_pixels(
     describer: ViewDescriber, T: Tensor, K: Tensor, size: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Floats, Flags]:
     """Pixels (P, 2) of the contours that a fit compares at a pose, and which of them are on the
     outline (P,) bool.
 
@@ -194,7 +193,7 @@ def contour_pixels(
     return pixels.numpy(), points.outline[0, is_point].numpy()
 
 
-def _mask(pixels: np.ndarray, size: Sequence[int]) -> np.ndarray:
+def _mask(pixels: Floats, size: Sequence[int]) -> Flags:
     """(H, W) bool: the pixels in which points (P, 2) lie; points outside are left out."""
     mask = np.zeros(tuple(size), bool)
     columns, rows = np.round(pixels).astype(np.int64).T
@@ -203,7 +202,7 @@ def _mask(pixels: np.ndarray, size: Sequence[int]) -> np.ndarray:
     return mask
 
 
-def _long_lines(lines: np.ndarray, least: float) -> np.ndarray:
+def _long_lines(lines: Flags, least: float) -> Flags:
     """Lines (H, W) without their parts that are shorter than ``least`` px; points at most two px
     apart are a line."""
     connected = cv2.dilate(lines.astype(np.uint8), np.ones((3, 3), np.uint8))
@@ -212,7 +211,7 @@ def _long_lines(lines: np.ndarray, least: float) -> np.ndarray:
     return np.asarray(lines & (extent >= least)[labels])
 
 
-def _distance(lines: np.ndarray) -> np.ndarray:
+def _distance(lines: Flags) -> Singles:
     """Distance of each pixel to the nearest pixel of the lines, smoothed so that stairs become
     slopes."""
     if not lines.any():
@@ -222,5 +221,5 @@ def _distance(lines: np.ndarray) -> np.ndarray:
     return blurred - np.float32(0.5)  # about 0 on the line again
 
 
-def _coverage(distance: np.ndarray, reach: float) -> np.ndarray:
+def _coverage(distance: Singles, reach: float) -> Singles:
     return np.asarray(np.clip(reach + 0.5 - distance, 0.0, 1.0))

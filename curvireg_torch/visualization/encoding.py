@@ -6,14 +6,16 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+from ..utils.arrays import Bytes
 
-def png(picture: np.ndarray) -> bytes:
+
+def png(picture: Bytes) -> bytes:
     """A PNG file of (H, W, 3 or 4) uint8 RGB or RGBA."""
     order = cv2.COLOR_RGB2BGR if picture.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
     return bytes(cv2.imencode(".png", cv2.cvtColor(picture, order))[1].tobytes())
 
 
-def jpeg(picture: np.ndarray, quality: int) -> bytes:
+def jpeg(picture: Bytes, quality: int) -> bytes:
     """A JPEG file of (H, W, 3) uint8 RGB; ``quality`` is 0 to 100."""
     return bytes(
         cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
@@ -25,7 +27,7 @@ def embedded(content: bytes) -> str:
     return f"data:image/jpeg;base64,{base64.b64encode(content).decode()}"
 
 
-def rescaled(picture: np.ndarray, scale: float) -> np.ndarray:
+def rescaled(picture: Bytes, scale: float) -> Bytes:
     """An (H, W, 3) uint8 picture, ``scale`` times as large."""
     if scale == 1.0:
         return picture
@@ -34,12 +36,12 @@ def rescaled(picture: np.ndarray, scale: float) -> np.ndarray:
     return np.asarray(cv2.resize(picture, size, interpolation=how), np.uint8)
 
 
-def shrink(picture: np.ndarray, side: int) -> np.ndarray:
+def shrink(picture: Bytes, side: int) -> Bytes:
     """An (H, W, 3) uint8 picture, resized so that its longer side is at most ``side`` px."""
     return rescaled(picture, min(1.0, side / max(picture.shape[:2])))
 
 
-def to_uint8(image: Tensor) -> np.ndarray:
+def to_uint8(image: Tensor) -> Bytes:
     """(H, W, 3) uint8 RGB, always a copy, of a (1 or 3, H, W) image, floating in [0, 1] or uint8;
     black for NaN."""
     pixels = image.detach().cpu()

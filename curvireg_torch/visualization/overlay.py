@@ -18,6 +18,7 @@ from ..registration import Hypothesis, Registrar, Registration
 from ..registration.confidence import two_decimals
 from ..registration.photograph import Photograph, as_photograph
 from ..terms import crop_photographs, photograph_field
+from ..utils.arrays import Bytes
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, ImageLike
 from .contours import Drawn, draw_close_up, draw_window
@@ -50,7 +51,7 @@ def contour_overlay(
     box: BoxLike | None = None,
     *,
     copies: Sequence[Registration] = (),
-) -> np.ndarray:
+) -> Bytes:
     """The photograph with the mesh's outline (green), its inner edges (orange) at the pose, and the
     box (white).
 
@@ -84,7 +85,7 @@ def _whole(
     item: Photograph,
     copies: Sequence[Registration],
     scale: float,
-) -> np.ndarray:
+) -> Bytes:
     """The photograph, resized by ``scale``, with the object and its copies."""
     target = registrar.of_mesh(getattr(result, "mesh_index", 0))
     axis = _axis_ends(registrar, result) if isinstance(result, Registration) else None
@@ -128,7 +129,7 @@ def drawn_copies(registrar: Registrar, copies: Sequence[Registration]) -> list[D
 def views_sheet(
     describer: ViewDescriber,
     views: Sequence[tuple[tuple[Tensor, Tensor], Tensor, Sequence[float] | None, str]],
-) -> np.ndarray:
+) -> Bytes:
     """(H, W, 3) uint8 RGB: photographs side by side; of each pose and camera matrix, pixels, box or
     None, caption."""
     columns = math.ceil(math.sqrt(len(views)))
@@ -146,7 +147,7 @@ def views_sheet(
 
 def _paste_tiles(
     sheet: Image.Image,
-    tiles: Sequence[tuple[str, np.ndarray]],
+    tiles: Sequence[tuple[str, Bytes]],
     corner: tuple[int, int],
     columns: int,
     size: tuple[int, int],
@@ -171,7 +172,7 @@ def side_pictures(
     result: Registration | Hypothesis,
     image: ImageLike | Photograph,
     box: BoxLike | None = None,
-) -> dict[str, np.ndarray]:
+) -> dict[str, Bytes]:
     """(S, S, 3) uint8 RGB of "photograph", "photograph field", "pose", "view field"; see
     :func:`contour_overlay`.
 
@@ -201,7 +202,7 @@ def side_pictures(
     }
 
 
-def _field_picture(field: Tensor) -> np.ndarray:
+def _field_picture(field: Tensor) -> Bytes:
     """Strong edges are dark, on white."""
     length = field.float().norm(dim=0, keepdim=True)
     return to_uint8(1.0 - (length / length.max().clamp(min=1e-12)).sqrt())
@@ -216,7 +217,7 @@ def registration_sheet(
     *,
     note: str = "",
     copies: Sequence[Registration] = (),
-) -> np.ndarray:
+) -> Bytes:
     """The photograph with the pose's contours and a caption; below it a close-up, the compared
     fields and the rivals.
 
@@ -302,7 +303,7 @@ def _draw_caption(
 
 def _small_pictures(
     registrar: Registrar, result: Registration, item: Photograph, side: int
-) -> list[tuple[str, np.ndarray]]:
+) -> list[tuple[str, Bytes]]:
     """Captions and pictures, at most ``side`` px wide and high."""
     box = item.box.tolist()
     objects = [Drawn(registrar.describer, pose.projection) for pose in result.hypotheses]

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..errors import OutputError
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.confidence import two_decimals
+from ..utils.arrays import Bytes
 from .contours import Drawn, draw_window
 from .overlay import VERDICT_COLOURS
 
@@ -74,7 +75,7 @@ class OverlayVideo(AbstractContextManager["OverlayVideo"]):
         self._writer.write(picture[..., ::-1])
         self._count += 1
 
-    def _open(self, picture: np.ndarray) -> cv2.VideoWriter:
+    def _open(self, picture: Bytes) -> cv2.VideoWriter:
         # the codec needs even numbers
         self._size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -122,7 +123,7 @@ def _frames_in(path: Path) -> int:
 
 def annotated_frame(
     registrar: Registrar, image: Tensor, result: Registration | FailedRegistration
-) -> np.ndarray:
+) -> Bytes:
     """(H, W, 3) uint8 of the image, of at most 960 px, with the mesh's contours if there is a pose,
     and a caption."""
     H, W = image.shape[-2:]
