@@ -1,6 +1,5 @@
 """One clean mesh from files, scenes and other meshes, and its measures."""
 
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -28,7 +27,7 @@ from ..formats.meshes.source import MeshWarning
 from ..utils.aliases import Fields, PathName
 from ..utils.arrays import Flags, Floats, Integers
 from ..utils.checks import check_option
-from ..utils.choices import UNITS, UP_AXES
+from ..utils.choices import UNITS, UP_AXES, unit_of_length
 from ..utils.likes import MeshLike
 from .colours import SurfaceColours, colours_of_parts, colours_vary
 from .health import precision_warning, stray_faces, stray_warning
@@ -168,7 +167,8 @@ def load_mesh(
     size = length * UNITS[unit]
     if not _is_plausible(size):
         likely = next((name for name in LIKELY_UNITS if _is_plausible(length * UNITS[name])), None)
-        advice = "" if found.unit else f"; if that is wrong, give the unit{_question(likely)}"
+        question = f" ({likely}?)" if likely else ""
+        advice = "" if found.unit else f"; if that is wrong, give the unit{question}"
         message = f"in unit {unit!r} the object is {size:g} m across{advice}"
         kind = "" if found.unit else "unit"
         warnings.warn(CurviregWarning(message, subject=path, kind=kind), stacklevel=2)
@@ -183,10 +183,6 @@ LIKELY_UNITS = ("mm", "m", "cm", "in")  # in which files are written, the most f
 def _is_plausible(metres: float) -> bool:
     """Whether an object in a photograph may be so large."""
     return 0.005 <= metres <= 100.0
-
-
-def _question(unit: str | None) -> str:
-    return "" if unit is None else f" ({unit}?)"
 
 
 def as_mesh(source: MeshLike, *, name: str = "mesh") -> Mesh:
@@ -313,9 +309,7 @@ def _unit_of(surface: Any) -> str | None:
         metres = trimesh.units.unit_conversion(surface.units, "meters")
     except (AttributeError, ValueError):
         return None
-    return next(
-        (unit for unit, length in UNITS.items() if math.isclose(metres, length, rel_tol=1e-6)), None
-    )
+    return unit_of_length(metres)
 
 
 def format_up(suffix: str) -> str:

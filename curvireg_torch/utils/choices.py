@@ -16,6 +16,18 @@ PRESET_NAMES = ("learned", "classical", "fast", "paper")
 # metres per unit
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
+
+def unit_of_length(metres: float) -> str | None:
+    """The unit that has so many metres, of those of ``UNITS``.
+
+    Example:
+        >>> unit_of_length(0.0254), unit_of_length(0.5)
+        ('in', None)
+    """
+    lengths = UNITS.items()
+    return next((unit for unit, length in lengths if abs(metres / length - 1.0) < 1e-6), None)
+
+
 PHONE_IMAGES = (".avif", ".heic", ".heif")  # which optional decoders read
 IMAGES = (
     ".bmp",

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TEXTURE_PIXELS
 from ...utils.arrays import Bytes, Floats, Integers
-from ...utils.choices import UNITS
+from ...utils.choices import unit_of_length
 from .colours import SurfaceColours, texture_pixels
 from .limits import check_corners
 
@@ -96,9 +96,8 @@ class ReadMesh:
     def in_unit_of(self, metres: float) -> "ReadMesh":
         """The mesh, whose unit has so many metres, in the unit of this length; in metres if it has
         no name."""
-        for name, length in UNITS.items():
-            if abs(metres / length - 1.0) < 1e-6:
-                return replace(self, unit=name)
+        if unit := unit_of_length(metres):
+            return replace(self, unit=unit)
         return replace(self, vertices=self.vertices * metres, unit="m")
 
     @classmethod
