@@ -18,7 +18,7 @@ from ..formats.pictures import (
     DIAGONAL_35MM,
     Metadata,
     as_in_file,
-    decoded,
+    opened_picture,
     oriented,
     picture_metadata,
 )
@@ -167,7 +167,8 @@ def read_photo(path: PathName, *, as_stored: bool = False) -> Photo:
         >>> photo.image.shape, int(photo.image[0, 0, 0]), photo.notes
         (torch.Size([3, 4, 6]), 51, ('grey: three equal channels',))
     """
-    found, _ = decoded(Path(path), lambda image, _, data: _decoded(image, data))
+    with opened_picture(Path(path)) as (image, _, data):
+        found = _decoded(image, data)
     return _photo(*found, as_stored=as_stored)
 
 

@@ -11,7 +11,7 @@ from ..utils.aliases import PathName
 from ..utils.arrays import Array, Singles
 from ..utils.choices import listed
 from .boxes import PictureSize
-from .pictures import as_in_file, decoded, oriented
+from .pictures import as_in_file, opened_picture, oriented
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -66,8 +66,9 @@ def read_mask(mask: PathName) -> Singles:
         [[0.0, 1.0], [0.0, 0.0]]
     """
     file, label = existing_mask(mask)
-    (values, largest), orientation = decoded(file, _values)
-    values = oriented(values, orientation)
+    with opened_picture(file) as (image, orientation, _):
+        values, largest = _grey(image)
+        values = oriented(as_in_file(values, image, orientation), orientation)
     if label is not None:
         return _labelled(values, label, file)
     try:
@@ -115,13 +116,8 @@ def _labelled(values: Array, label: int, file: Path) -> Singles:
     return np.asarray(chosen, dtype=np.float32)
 
 
-def _values(image: "Image", orientation: int, _: bytes) -> tuple[Array, int]:
-    """(H, W) values of an open picture, as they are stored, and the value of white."""
-    values, largest = _grey(image)
-    return as_in_file(values, image, orientation), largest
-
-
 def _grey(image: "Image") -> tuple[Array, int]:
+    """(H, W) values of an open picture, and the value of white."""
     if image.mode == "P":
         indices = np.asarray(image)
         colours = np.asarray(image.convert("RGB")).max(axis=2)

@@ -2,10 +2,10 @@
 
 import math
 import re
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..errors import MAX_IMAGE_BYTES, CurviregError, ImageError, MissingFileError
 from ..utils.aliases import Size
@@ -17,7 +17,6 @@ from .heif import open_photograph
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-T = TypeVar("T")
 _WIDTH = 256
 _HEIGHT = 257
 _SUBFILE = 254
@@ -59,24 +58,20 @@ class Metadata(NamedTuple):
 def picture_size(path: Path) -> PictureSize:
     """The size of a photograph as :func:`read_photo` shows it, from its header; errors are the
     same."""
-
-    def stored_size(image: "Image", *_: object) -> tuple[int, int]:
+    with opened_picture(path) as (image, orientation, _):
         # of a TIFF, whose size Pillow turns or not, by its version
         tags = getattr(image, "tag_v2", {})
-        return int(tags.get(_WIDTH, image.width)), int(tags.get(_HEIGHT, image.height))
-
-    (width, height), orientation = decoded(path, stored_size)
-    is_turned = orientation > 4
-    return PictureSize((width, height) if is_turned else (height, width), orientation)
+        stored = int(tags.get(_HEIGHT, image.height)), int(tags.get(_WIDTH, image.width))
+    return PictureSize(stored[::-1] if orientation > 4 else stored, orientation)
 
 
-def decoded(path: Path, read: Callable[["Image", int, bytes], T]) -> tuple[T, int]:
-    """What ``read`` makes of the open picture of a file, its EXIF orientation and its bytes; and
-    this orientation.
+@contextmanager
+def opened_picture(path: Path) -> Iterator[tuple["Image", int, bytes]]:
+    """Context with the picture of a file, its EXIF orientation, and the bytes of the file.
 
     Raises:
         MissingFileError: the file does not exist.
-        CurviregError: it cannot be decoded, or a decoder is missing.
+        CurviregError: it cannot be decoded, also within the context, or a decoder is missing.
     """
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the photograph", subject=path)
@@ -87,8 +82,7 @@ def decoded(path: Path, read: Callable[["Image", int, bytes], T]) -> tuple[T, in
         with open_photograph(data) as image:
             _seek_full_image(image)
             check_pixels(image)
-            orientation = picture_metadata(image).orientation
-            return read(image, orientation, data), orientation
+            yield image, picture_metadata(image).orientation, data
     except CurviregError as error:
         raise error.with_subject(path) from error.__cause__
     except Exception as error:  # Pillow raises errors of any kind for damaged files
@@ -142,19 +136,15 @@ def picture_metadata(image: "Image", data: bytes = b"") -> Metadata:
             focal = zoom * _focal_by_sensor(directory, size)
             zoom = 1.0
     valid = isinstance(orientation, int) and orientation in range(1, 9)
+    found = image.info.get("xmp", b"")  # where Pillow looks for it
+    xmp = found if isinstance(found, bytes) else str(found).encode()
     return Metadata(
         orientation if valid else 1,
         focal if 0 < focal < math.inf else None,
         (height, width) if width > 0 and height > 0 else None,
         zoom if focal > 0 else 1.0,
-        any(_PANORAMA.search(part) for part in (data[:MAX_METADATA_BYTES], _xmp(image))),
+        any(_PANORAMA.search(part) for part in (data[:MAX_METADATA_BYTES], xmp)),
     )
-
-
-def _xmp(image: "Image") -> bytes:
-    """The XMP of a picture that Pillow has found."""
-    found = image.info.get("xmp", b"")
-    return found if isinstance(found, bytes) else str(found).encode()
 
 
 def _focal_by_sensor(directory: Mapping[int, Any], size: tuple[int, int]) -> float:
