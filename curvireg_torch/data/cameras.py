@@ -30,15 +30,12 @@ def load_camera(path: PathName) -> Camera:
     return Calibrations().load(path)
 
 
-class Calibrations:
-    """Calibration files, each of which is read once, however many of its cameras are asked for."""
-
-    def __init__(self) -> None:
-        self._files = CameraFiles()
+class Calibrations(CameraFiles):
+    """:class:`.CameraFiles` of which cameras of the library are made."""
 
     def load(self, path: PathName) -> Camera:
         """:func:`load_camera`."""
-        record = self._files.read(path)
+        record = self.read(path)
         try:
             return Camera(
                 torch.tensor(record.matrix, dtype=torch.float64),

@@ -162,8 +162,7 @@ def _matrix_rows(numbers: Sequence[float]) -> list[list[float]]:
             "camera matrix: expected 3 x 3 numbers, got a projection that also moves the camera"
         )
     K = K[:3, :3]
-    rows: list[list[float]] = (K.T if K[2, :2].any() else K).tolist()
-    return rows
+    return (K.T if K[2, :2].any() else K).tolist()
 
 
 def _read_matrix(record: Record) -> list[float]:
@@ -522,26 +521,6 @@ def _mei(record: Record) -> CameraRecord:
     raise _unsupported("MEI")
 
 
-UNREAD = {
-    "cameraAperture|cameraFocalLength": (
-        "camera_params of Isaac Sim; write fx = width * cameraFocalLength / cameraAperture[0], fy "
-        "= height * cameraFocalLength / cameraAperture[1], cx = (width - 1) / 2 and cy = (height - "
-        "1) / 2"
-    ),
-    "pxFocalLength|sensorWidth": (
-        "cameras of Meshroom; export them as COLMAP, or write fx = fy = width * focalLength / "
-        "sensorWidth, cx = width / 2 + principalPoint[0] - 0.5 and cy = height / 2 + "
-        "principalPoint[1] - 0.5"
-    ),
-    "android.lens.intrinsicCalibration|LENS_INTRINSIC_CALIBRATION|intrinsicCalibration": (
-        "a calibration of Android's Camera2; write its first four numbers as fx, fy, cx, cy, its "
-        "lens distortion (a, b, c, d, e) as distortion_coefficients: [a, b, d, e, c], and the "
-        "size of the pre-correction active array as width and height"
-    ),
-}
-"""Keys of cameras that are not read, and how to write those."""
-
-
 def _unread(keys: str, sentence: str) -> Format:
     """A format that is refused with a sentence that says how to write the camera."""
 
@@ -552,7 +531,24 @@ def _unread(keys: str, sentence: str) -> Format:
 
 
 FORMATS = (
-    *(_unread(keys, sentence) for keys, sentence in UNREAD.items()),
+    _unread(
+        "cameraAperture|cameraFocalLength",
+        "camera_params of Isaac Sim; write fx = width * cameraFocalLength / cameraAperture[0], fy "
+        "= height * cameraFocalLength / cameraAperture[1], cx = (width - 1) / 2 and cy = (height - "
+        "1) / 2",
+    ),
+    _unread(
+        "pxFocalLength|sensorWidth",
+        "cameras of Meshroom; export them as COLMAP, or write fx = fy = width * focalLength / "
+        "sensorWidth, cx = width / 2 + principalPoint[0] - 0.5 and cy = height / 2 + "
+        "principalPoint[1] - 0.5",
+    ),
+    _unread(
+        "android.lens.intrinsicCalibration|LENS_INTRINSIC_CALIBRATION|intrinsicCalibration",
+        "a calibration of Android's Camera2; write its first four numbers as fx, fy, cx, cy, its "
+        "lens distortion (a, b, c, d, e) as distortion_coefficients: [a, b, d, e, c], and the "
+        "size of the pre-correction active array as width and height",
+    ),
     Format("colmap", _colmap),
     Format("kitti", _kitti),
     Format("fl_x|camera_angle_x", _nerfstudio, inherits=True),

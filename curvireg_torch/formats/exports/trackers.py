@@ -137,8 +137,7 @@ def _axis_angle(quaternion: Sequence[float]) -> Floats:
 def _pixels(points: Floats, T: Floats, K: Sequence[Sequence[float]]) -> Floats:
     """(N, 2) pixels of points (N, 3)."""
     seen = transform_points(points, T) @ np.array(K).T
-    pixels: Floats = seen[:, :2] / seen[:, 2:]
-    return pixels
+    return np.asarray(seen[:, :2] / seen[:, 2:])
 
 
 def _spread(points: Floats, count: int) -> list[int]:

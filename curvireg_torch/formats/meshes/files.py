@@ -125,11 +125,8 @@ def read_source(source: MeshSource, link: str | None = None) -> ReadMesh:
                 "the file ends too early, or has binary faces with different numbers of corners: "
                 "export triangles"
             )
-        raise _unreadable(path, reason) from error
-
-
-def _unreadable(path: Path, reason: str) -> MeshError:
-    return MeshError(f"cannot be read as a mesh ({reason}); re-export the file", subject=path)
+        message = f"cannot be read as a mesh ({reason}); re-export the file"
+        raise MeshError(message, subject=path) from error
 
 
 def _check_start(path: Path) -> None:
