@@ -25,10 +25,9 @@ MAX_ROUNDS = 8
 def angles_near(angles: Tensor, reference: Tensor) -> Tensor:
     """(N, 3) azimuth, elevation, theta in degrees of the same views as ``angles`` (N, 3), as near
     ``reference`` (3,) as they can be: past a pole the elevation runs on."""
-    turn = torch.tensor([180.0, 180.0, 180.0], dtype=angles.dtype)
-    over = turn + angles * torch.tensor([1.0, -1.0, 1.0], dtype=angles.dtype)
+    over = 180.0 + angles * torch.tensor([1.0, -1.0, 1.0], dtype=angles.dtype)
     both = torch.stack([angles, over])
-    both = reference + torch.remainder(both - reference + turn, 360.0) - turn
+    both = reference + torch.remainder(both - reference + 180.0, 360.0) - 180.0
     nearer = (both - reference).abs().sum(dim=2).argmin(dim=0)
     return both[nearer, torch.arange(len(angles))]
 
@@ -54,8 +53,8 @@ def coherent_views(angles: Tensor, steps: tuple[float, float, float] = NEIGHBOUR
 
 def divided(low: float, high: float, step: float) -> Tensor:
     """Numbers from ``low`` to ``high``, both among them, in equal steps of about ``step``."""
-    count = round((high - low) / step) + 1 if high > low else 1
-    return torch.linspace(low, high, max(count, 2 if high > low else 1), dtype=torch.float64)
+    steps = max(round((high - low) / step), int(high > low))
+    return torch.linspace(low, high, steps + 1, dtype=torch.float64)
 
 
 def motion(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> float:
@@ -87,14 +86,12 @@ def search(
     it (docs/paper.md has the effect).
     """
     bank = matcher.bank
-    frame = view_frame(bank.mesh, bank.pipeline.views)
+    frame, rotations, angles = _views_in_frame(bank)
     perspective = bank.settings.camera == "perspective"
     order = ranking.order[0].cpu()
     if ranking.allowed is not None:
         order = order[ranking.allowed[0].cpu()[order]]
-    rotations = bank.rotations.cpu().double() @ frame.T
     distances = bank.views.distance.cpu().double()
-    angles = torch.stack(viewpoint_from_rotation(rotations), dim=1)
     steps = NEIGHBOUR_STEPS
     width = ANGLE_STEP
     farther = DISTANCE_STEP
@@ -123,6 +120,14 @@ def search(
         width = width / 2.0
         farther = farther / 2.0
     return pose[0] @ frame, pose[1] * mesh_radius(bank.mesh)
+
+
+def _views_in_frame(bank: ViewBank) -> tuple[Tensor, Tensor, Tensor]:
+    """The frame (3, 3) in which angles of a bank's views are; their rotations (N, 3, 3) in it, and
+    azimuths, elevations and thetas (N, 3) in degrees, float64."""
+    frame = view_frame(bank.mesh, bank.pipeline.views)
+    rotations = bank.rotations.cpu().double() @ frame.T
+    return frame, rotations, torch.stack(viewpoint_from_rotation(rotations), dim=1)
 
 
 def _ranked(
@@ -158,14 +163,13 @@ def _coherent(
 
 def coherent_of(bank: ViewBank, ranking: Ranking) -> Tensor:
     """(K,) the views between which :func:`search` begins, for one photograph."""
-    frame = view_frame(bank.mesh, bank.pipeline.views)
-    rotations = bank.rotations.cpu().double() @ frame.T
-    angles = torch.stack(viewpoint_from_rotation(rotations), dim=1)
+    _, rotations, angles = _views_in_frame(bank)
     perspective = bank.settings.camera == "perspective"
     order = ranking.order[0].cpu()
-    return _coherent(rotations, angles, order, NEIGHBOUR_STEPS, least=1, with_distance=perspective)[
-        0
-    ]
+    views, _ = _coherent(
+        rotations, angles, order, NEIGHBOUR_STEPS, least=1, with_distance=perspective
+    )
+    return views
 
 
 @torch.no_grad()
@@ -173,9 +177,8 @@ def refine(matcher: ViewMatcher, query: QueryFeatures, view: int) -> Tensor:
     """(3, 3) float64 the best of nine views: one of the bank, and those :data:`ANGLE_STEP` beside
     it in azimuth and elevation."""
     bank = matcher.bank
-    frame = view_frame(bank.mesh, bank.pipeline.views)
-    rotation = bank.rotations[view].cpu().double() @ frame.T
-    azimuth, elevation, theta = (angle.double() for angle in viewpoint_from_rotation(rotation))
+    frame, _, angles = _views_in_frame(bank)
+    azimuth, elevation, theta = angles[view]
     steps = torch.tensor([-ANGLE_STEP, 0.0, ANGLE_STEP], dtype=torch.float64)
     axes = (azimuth + steps, elevation + steps, theta[None])
     columns = [axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij")]
