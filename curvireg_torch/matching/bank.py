@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 import trimesh
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
@@ -33,6 +32,7 @@ from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
 from ..terms import Appearance
 from ..utils.aliases import Fields, PathName
+from ..utils.arrays import Array
 from ..utils.checks import check_finite, check_symmetries, check_tensor
 from ..utils.files import tensor_checksum, write_tensors
 from ..utils.likes import MeshLike
@@ -45,7 +45,6 @@ FORMAT_VERSION = 11
 PIXELS_AT_A_TIME = 72 * 128**2  # of views that a thread holds in memory, about 60 bytes each
 TURNS = 24  # in-plane rotations of the default views: quarter turns among them share a rendering
 VIEWS_ON_DEVICE = 480  # the same on another device than the CPU
-PIXEL_BITS = (128, 64, 32, 16, 8, 4, 2, 1)  # of eight pixels in a byte
 EXTREME_TOLERANCE = 0.02  # radii by which the points that bound projections may miss the mesh's box
 REBUILD = "build it again"
 
@@ -327,7 +326,6 @@ class ViewBank:
             tensors, metadata = _contents(path)
             pipeline = Pipeline.from_json(metadata["pipeline"])
             views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
-            tensors["descriptors"] = tensors["descriptors"].float()
             mesh = _mesh(tensors, metadata)
             _check_contents(views, pipeline.bank, tensors)
             packings = _packings(tensors, json.loads(metadata["packing"]), len(views))
@@ -393,12 +391,7 @@ def packed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def _pack(mask: Tensor) -> Tensor:
     """(N, ceil(P / 8)) uint8 of (N, P) bool."""
-    if mask.device.type == "cpu":
-        return torch.from_numpy(np.packbits(mask.numpy(), axis=1))
-    bits = F.pad(mask, (0, -mask.shape[1] % 8)).unflatten(1, (-1, 8)).to(torch.uint8)
-    values = torch.tensor(PIXEL_BITS, dtype=torch.uint8, device=mask.device)
-    packed: Tensor = (bits * values).sum(dim=2, dtype=torch.uint8)
-    return packed
+    return torch.from_numpy(np.packbits(mask.cpu().numpy(), axis=1)).to(mask.device)
 
 
 def _mesh(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> Mesh:
@@ -478,12 +471,12 @@ def _plane(rows: Tensor) -> Tensor | None:
     return rows[0] if len(rows) else None
 
 
-def colour_arrays(mesh: Mesh) -> dict[str, np.ndarray]:
+def colour_arrays(mesh: Mesh) -> dict[str, Array]:
     """The mesh's colours as arrays, without loss; empty for a mesh without colours."""
     colours = mesh.colours
     if colours is None:
         return {}
-    arrays: dict[str, np.ndarray] = {
+    arrays: dict[str, Array] = {
         "corners": colours.corners,
         "uv": colours.uv,
         "texture": colours.texture,

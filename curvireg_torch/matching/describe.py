@@ -40,8 +40,7 @@ def depth_filter(settings: BankSettings) -> nn.Module:
         if settings.depth_field == "CS"
         else {}
     )
-    layer: nn.Module = DEPTH_FIELDS[settings.depth_field](**options)
-    return layer
+    return DEPTH_FIELDS[settings.depth_field](**options)
 
 
 def hog_layer(settings: BankSettings) -> HOG:

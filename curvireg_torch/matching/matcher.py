@@ -4,7 +4,6 @@ views."""
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Self
 
 import torch
@@ -36,7 +35,7 @@ from ..utils.likes import BoxesLike
 from ..utils.precision import full_precision
 from ..utils.threads import map_on_threads
 from .bank import ViewBank, packed, views_at_a_time
-from .cells import ROUNDING_OF_TRACE, DescribedViews, best_cells
+from .cells import ROUNDING_OF_TRACE, DescribedViews, best_cells, cells_of_views
 from .describe import ViewDescriber, hog_layer
 
 # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
@@ -181,16 +180,13 @@ class ViewMatcher(nn.Module):
 
     @cached_property
     def _described_views(self) -> DescribedViews:
-        return DescribedViews(self._described_views_file())
-
-    def _described_views_file(self) -> Path | None:
-        """Where features of pictures that this renderer draws of a cached bank are kept. Other
-        renderers draw others; those of a custom one, whose name says nothing, are not kept."""
+        """Of a cached bank kept in a file for the renderer, as others draw other pictures; those of
+        a custom one, whose name says nothing, are not kept."""
         shared = self.bank.described_views_file
         if shared is None or not isinstance(self._renderer, str):
-            return None
+            return DescribedViews(None)
         digest = text_digest(f"{shared.name} {self._renderer}", size=16)
-        return shared.with_name(f"views-{digest}.safetensors")
+        return DescribedViews(shared.with_name(f"views-{digest}.safetensors"))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move to another device. Modules convert their tensors by a function: what it does to one
@@ -364,9 +360,8 @@ class ViewMatcher(nn.Module):
             similarity = appearance.compare(query, self._features_of_views(compared)).to(log)
             for b, index in enumerate(selected):
                 raw[b, index] = similarity[b, torch.searchsorted(compared, index)]
-                # a relative rotation's trace grows as its angle falls
-                traces = R.flatten(1) @ R[index].flatten(1).T
-                score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
+                nearest = cells_of_views(R, index)
+                score[b] = term.log_score(raw[b : b + 1, index])[0, nearest]
         return log + term.weight * score, {term.name: raw}
 
     def _features_of_views(self, views: Tensor) -> Tensor:
