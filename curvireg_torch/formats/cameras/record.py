@@ -136,8 +136,7 @@ def distortion_keys(value: Any, others: Container[int]) -> Iterator[tuple[int, s
     """
     if isinstance(value, list):
         for item in value:
-            if isinstance(item, dict | list):
-                yield from distortion_keys(item, others)
+            yield from distortion_keys(item, others)
     if isinstance(value, dict) and id(value) not in others:
         yield from distortion_keys_inside(value, others)
 

@@ -1,11 +1,11 @@
 """A start pose and the mesh as other trackers read them: M3T (and pym3t), and ViSP; in metres."""
 
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 from trimesh.transformations import transform_points
 
 from ...errors import InvalidInputError
@@ -107,7 +107,8 @@ def write_visp(out: Path, vertices: Floats, faces: Integers, document: Document)
         *(f"{v:.6f} {u:.6f}" for u, v in _pixels(some, T, document["camera"]["matrix"])),
     ]
     _write_lines(out / "object.init", init)
-    numbers = [*T[:3, 3], *_axis_angle(document["quaternion"])]
+    turn = Rotation.from_quat(document["quaternion"], scalar_first=True).as_rotvec()
+    numbers = [*T[:3, 3], *turn]
     _write_lines(out / "object.pos", (f"{x:.12g}" for x in numbers))
 
 
@@ -124,14 +125,6 @@ def _pose_in_metres(document: Document, name: str) -> tuple[Floats, float]:
     T[:3, :3] = document["rotation"]
     T[:3, 3] = metres * np.array(document["translation"])
     return T, metres
-
-
-def _axis_angle(quaternion: Sequence[float]) -> Floats:
-    """(3,) axis x angle, the angle in radians, at most pi, of w, x, y, z."""
-    w, *vector = quaternion
-    sine = math.hypot(*vector)
-    angle = 2.0 * math.atan2(sine, abs(w))
-    return np.array(vector) * math.copysign(angle, w) / max(sine, 1e-300)
 
 
 def _pixels(points: Floats, T: Floats, K: Sequence[Sequence[float]]) -> Floats:
