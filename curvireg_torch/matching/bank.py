@@ -272,7 +272,7 @@ class ViewBank:
         """Write a safetensors file atomically. Descriptors in float16 change cosines by less than
         1e-4."""
         contents = {**self.tensors, "descriptors": self.descriptors.half()}
-        contents |= {f"views.{f.name}": getattr(self.views, f.name) for f in fields(ViewSphere)}
+        contents |= {f"views.{name}": x for name, x in self.views.columns().items()}
         arrays = {f"mesh.{name}": x for name, x in colour_arrays(self.mesh).items()}
         surfaces = {"mesh": self.mesh.surface}
         if len(self.mesh.faces) > VIEW_FACES:
@@ -509,7 +509,7 @@ def _check_contents(
             raise ValueError(f"{name}: not of the shape that the settings say, or not finite")
     if any(tensors[name].dtype != torch.uint8 for name in ("points", "silhouettes")):
         raise ValueError("points, silhouettes: expected uint8")
-    if not all(bool(getattr(views, f.name).isfinite().all()) for f in fields(ViewSphere)):
+    if not all(bool(x.isfinite().all()) for x in views.columns().values()):
         raise ValueError("viewpoints that are not finite")
     if (
         not tensors["descriptors"].any()
@@ -526,13 +526,11 @@ def _packings(
     if angle is None:
         return {}
     packing = Packing(tensors["packing.representatives"], tensors["packing.cells"])
-    for index, limit in (
-        (packing.representatives, count),
-        (packing.cells, len(packing.representatives)),
-    ):
-        if index.dtype != torch.int64 or int(index.min()) < 0 or int(index.max()) >= limit:
-            raise ValueError("packing: not of the bank's views")
-    if packing.representatives.ndim != 1 or packing.cells.shape != (count,):
+    limits = count, len(packing.representatives)
+    is_valid = packing.representatives.ndim == 1 and packing.cells.shape == (count,)
+    for index, limit in zip(packing, limits, strict=True):
+        is_valid &= index.dtype == torch.int64 and 0 <= int(index.min()) <= int(index.max()) < limit
+    if not is_valid:
         raise ValueError("packing: not of the bank's views")
     return {float(angle): packing}
 

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
@@ -88,9 +88,7 @@ def bank_key(
     tensors = {
         name: torch.from_numpy(np.array(x)) for name, x in {**arrays, **colour_arrays(mesh)}.items()
     }
-    tensors |= {
-        f"views.{field.name}": getattr(views, field.name).double() for field in fields(ViewSphere)
-    }
+    tensors |= {f"views.{name}": x.double() for name, x in views.columns().items()}
     facts = [FORMAT_VERSION, settings, mesh.up, renderer]
     digests = [package_digest(without=NOT_IN_BANKS), tensor_digest(tensors, size=16)]
     return text_digest(json.dumps([facts, digests], sort_keys=True), size=16)
