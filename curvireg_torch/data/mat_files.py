@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from ..errors import MAX_CAD_MEMORY, MAX_CAD_SECONDS, MAX_MAT_BYTES, WorkerError
+from ..errors import MAX_MAT_BYTES, WorkerError
 from ..utils.programs import run_program
 
 MatStruct = dict[str, "MatValue"]
@@ -38,8 +38,6 @@ def read_mats(paths: Sequence[Path], variable: str) -> Iterator[MatValue]:
                     _PROGRAM,
                     [str(asked), str(found)],
                     name="SciPy",
-                    seconds=MAX_CAD_SECONDS,
-                    memory=MAX_CAD_MEMORY,
                     advice="",
                 )
             if not found.exists():  # else each file would count as damaged

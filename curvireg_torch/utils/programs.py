@@ -7,6 +7,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..errors import MAX_CAD_MEMORY, MAX_CAD_SECONDS
+
 _OUT_OF_MEMORY = 77  # exit status of a program that was refused memory
 # macOS and Windows have no such limit
 _START = f"""
@@ -26,26 +28,25 @@ except MemoryError:
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "1"}
 
 
-def run_program(
-    program: Path, arguments: Sequence[str], *, name: str, seconds: float, memory: int, advice: str
-) -> bool:
+def run_program(program: Path, arguments: Sequence[str], *, name: str, advice: str) -> bool:
     """Run the Python program of a file, without its output; returns whether it ended well.
 
     Raises:
-        ValueError: it took more than ``seconds``, or more than ``memory`` bytes where the system
-            can limit them; the message has the ``name`` of what it runs, and the ``advice``.
+        ValueError: it took more time than ``MAX_CAD_SECONDS``, or more memory than
+            ``MAX_CAD_MEMORY`` where the system can limit it; the message has the ``name`` of what
+            it runs, and the ``advice``.
     """
-    command = [sys.executable, "-P", "-c", _START, str(memory), str(program), *arguments]
+    command = [sys.executable, "-P", "-c", _START, str(MAX_CAD_MEMORY), str(program), *arguments]
     try:
         ended = subprocess.run(
             command,
             capture_output=True,
-            timeout=seconds,
+            timeout=MAX_CAD_SECONDS,
             check=False,
             env={**os.environ, **_ONE_THREAD},
         )
     except subprocess.TimeoutExpired:
-        raise ValueError(f"{name} took more than {seconds} seconds; {advice}") from None
+        raise ValueError(f"{name} took more than {MAX_CAD_SECONDS} seconds; {advice}") from None
     if ended.returncode == _OUT_OF_MEMORY or b"bad_alloc" in ended.stderr:
-        raise ValueError(f"{name} needs more than {memory:,} bytes of memory; {advice}")
+        raise ValueError(f"{name} needs more than {MAX_CAD_MEMORY:,} bytes of memory; {advice}")
     return ended.returncode == 0

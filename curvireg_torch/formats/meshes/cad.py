@@ -14,8 +14,6 @@ from PIL import Image
 
 from ...errors import (
     MAX_CAD_BYTES,
-    MAX_CAD_MEMORY,
-    MAX_CAD_SECONDS,
     MAX_MESH_BYTES,
     MAX_TEXTURE_PIXELS,
 )
@@ -72,8 +70,6 @@ def _converted(path: Path, kind: str) -> bytes:
             _PROGRAM,
             [str(path), str(out), kind, str(LINEAR_TOLERANCE), str(ANGULAR_TOLERANCE)],
             name="OpenCASCADE",
-            seconds=MAX_CAD_SECONDS,
-            memory=MAX_CAD_MEMORY,
             advice="export it as STL or OBJ",
         )
         size = out.stat().st_size if out.is_file() else 0

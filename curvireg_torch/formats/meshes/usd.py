@@ -11,8 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import (
-    MAX_CAD_MEMORY,
-    MAX_CAD_SECONDS,
     MAX_IMAGE_BYTES,
     MAX_MESH_BYTES,
     MAX_MESH_FACES,
@@ -56,8 +54,6 @@ def _parts_of(path: Path) -> tuple[Fields, Arrays]:
             _PROGRAM,
             [str(path), str(out), *bounds],
             name="OpenUSD",
-            seconds=MAX_CAD_SECONDS,
-            memory=MAX_CAD_MEMORY,
             advice="export it as OBJ or GLB",
         )
         if not out.is_file():

@@ -12,7 +12,7 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError, MissingDependencyError
 from curvireg_torch.formats.meshes import cad
 from curvireg_torch.formats.meshes.files import mesh_files
-from curvireg_torch.utils import extras
+from curvireg_torch.utils import extras, programs
 from curvireg_torch.utils.extras import is_installed
 from tests._support.quick import slow_after
 from tests._support.refusals import refused
@@ -75,7 +75,7 @@ def test_step_files_are_bounded_in_size_and_time(write, monkeypatch):
         ("MAX_MESH_BYTES", 99, "more than 99 bytes"),
         ("MAX_CAD_SECONDS", 0.001, "took more than 0.001 seconds"),
     ):
-        monkeypatch.setattr(cad, name, value)
+        monkeypatch.setattr(programs if name == "MAX_CAD_SECONDS" else cad, name, value)
         with refused(match, MeshError):
             cr.load_mesh(path)
         monkeypatch.undo()

@@ -15,6 +15,7 @@ from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import cad, colours, files, gltf, limits, source, threemf, usd
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, is_file_name
 from curvireg_torch.formats.xml_files import read_xml
+from curvireg_torch.utils import programs
 from curvireg_torch.utils.extras import is_installed
 from curvireg_torch.utils.programs import run_program
 from tests._support.refusals import refused
@@ -277,24 +278,27 @@ def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(tmp_path, wri
         cr.load_mesh(path)
 
 
-def test_a_program_has_limits_of_time_and_memory(tmp_path):
+def test_a_program_has_limits_of_time_and_memory(tmp_path, monkeypatch):
     program = tmp_path / "program.py"
-    limits = {"name": "It", "seconds": 60.0, "memory": 1 << 28, "advice": "export less"}
+    words = {"name": "It", "advice": "export less"}
+    monkeypatch.setattr(programs, "MAX_CAD_SECONDS", 60.0)
+    monkeypatch.setattr(programs, "MAX_CAD_MEMORY", 1 << 28)
     program.write_text("import sys\nsys.exit(int(sys.argv[1]))")
-    assert run_program(program, ["0"], **limits)
-    assert not run_program(program, ["1"], **limits)
+    assert run_program(program, ["0"], **words)
+    assert not run_program(program, ["1"], **words)
     program.write_text("x = bytearray(1 << 29)")
     with refused(r"It needs more than 268,435,456 bytes .*; export less", ValueError):
-        run_program(program, [], **limits)
+        run_program(program, [], **words)
     program.write_text("while True:\n    pass")
+    monkeypatch.setattr(programs, "MAX_CAD_SECONDS", 0.2)
     with refused(r"It took more than 0.2 seconds; export less", ValueError):
-        run_program(program, [], **{**limits, "seconds": 0.2})
+        run_program(program, [], **words)
 
 
 @pytest.mark.skipif(not is_installed("cascadio"), reason="cascadio is not installed")
 def test_opencascade_has_a_limit_of_memory(tmp_path, write, monkeypatch):
     write("a.step", step_file((3.0, 2.0, 1.0), "mm"))
-    monkeypatch.setattr(cad, "MAX_CAD_MEMORY", 1 << 28)
+    monkeypatch.setattr(programs, "MAX_CAD_MEMORY", 1 << 28)
     with refused(r"OpenCASCADE (needs more than|finds no shape)", MeshError):
         cr.load_mesh(tmp_path / "a.step")
 
@@ -326,6 +330,6 @@ def "b" (
     for key in ("0.", "1."):
         assert arrays[key + "points"].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
         assert arrays[key + "indices"].tolist() == [0, 1, 2]
-    monkeypatch.setattr(usd, "MAX_CAD_MEMORY", 1 << 27)
+    monkeypatch.setattr(programs, "MAX_CAD_MEMORY", 1 << 27)
     with refused(r"OpenUSD (needs more than|cannot read)", MeshError):
         cr.load_mesh(path)

@@ -11,6 +11,7 @@ from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import usd
 from curvireg_torch.formats.meshes.files import mesh_files
 from curvireg_torch.mesh.colours import colours_at
+from curvireg_torch.utils import programs
 from curvireg_torch.utils.extras import is_installed
 from tests._support.refusals import refused
 from tests.formats.meshes.pictures import encoded, painted
@@ -260,7 +261,7 @@ def test_bounds(write, monkeypatch):
         ("MAX_MESH_BYTES", 9, "more than 36 bytes"),
         ("MAX_CAD_SECONDS", 0.001, "took more than 0.001 seconds"),
     ):
-        monkeypatch.setattr(usd, name, value)
+        monkeypatch.setattr(programs if name == "MAX_CAD_SECONDS" else usd, name, value)
         with refused(match, MeshError):
             cr.load_mesh(path, unit="mm")
         monkeypatch.undo()
