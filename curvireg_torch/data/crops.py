@@ -144,16 +144,13 @@ def viewpoint_bins(rotation: Tensor, bins: Sequence[int]) -> Tensor:
     if not bool(rotation.isfinite().all()):
         return torch.full((len(_ANGLES),), UNKNOWN_CLASS)
     # not as annotated, where an elevation may lie past the pole
-    viewpoint = [float(angle) for angle in viewpoint_from_rotation(rotation.double())]
-    numbers = []
-    for angle, start, extent, count in zip(viewpoint, _START, _RANGE, bins, strict=True):
-        # Rounded, so that 30 degrees that a rotation gives back as 29.9999 lie in the bin that
-        # begins there.
-        degrees = round(angle - start, 3)
-        if extent == 360.0:
-            degrees %= extent
-        numbers.append(min(math.floor(degrees / extent * count), count - 1))
-    return torch.tensor(numbers)
+    viewpoint = torch.stack(viewpoint_from_rotation(rotation.double()))
+    # Rounded, so that 30 degrees that a rotation gives back as 29.9999 lie in the bin that begins
+    # there.
+    degrees = (viewpoint - torch.tensor(_START)).round(decimals=3) % 360.0
+    counts = torch.tensor(bins)
+    numbers = (degrees / torch.tensor(_RANGE) * counts).floor().long()
+    return torch.minimum(numbers, counts - 1)
 
 
 def _reason_to_leave_out(item: Sample) -> str | None:
