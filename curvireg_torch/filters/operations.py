@@ -136,12 +136,9 @@ def apply_to_photograph(
         if not is_host_readable(x) or not _has_empty_border(mask):
             return on_filled(x, mask)
         # Each of a padded batch by itself, without what is padded: as it would be alone.
-        parts = [_on_inside(on_filled, *one) for one in zip(x.split(1), mask.split(1), strict=True)]
-        padded = [
-            [F.pad(plane, beyond, value=missing_value) for plane in planes]
-            for planes, beyond in parts
-        ]
-        return tuple(torch.cat(planes) for planes in zip(*padded, strict=True))
+        each = zip(x.split(1), mask.split(1), strict=True)
+        parts = [_on_inside(on_filled, *one, missing_value) for one in each]
+        return tuple(torch.cat(planes) for planes in zip(*parts, strict=True))
 
     return apply_in_blocks(on_photographs, to_grey(at_least_float32(image))).to(image.dtype)
 
@@ -153,17 +150,18 @@ def _has_empty_border(mask: Tensor) -> bool:
 
 
 def _on_inside(
-    layer: Callable[[Tensor, Tensor], Planes], x: Tensor, mask: Tensor
-) -> tuple[Planes, tuple[int, int, int, int]]:
-    """``layer`` of the bounding box of the valid pixels of one image, and what F.pad has to add:
-    left, right, top, bottom. An image without any is its own box."""
+    layer: Callable[[Tensor, Tensor], Planes], x: Tensor, mask: Tensor, missing_value: float
+) -> Planes:
+    """``layer`` of the bounding box of the valid pixels of one image, and ``missing_value`` beyond
+    it. An image without any is its own box."""
     H, W = x.shape[-2:]
     valid = ~mask[0, 0]
     rows = valid.any(dim=1).nonzero().flatten().tolist() or [0, H - 1]
     columns = valid.any(dim=0).nonzero().flatten().tolist() or [0, W - 1]
     inside = (..., slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     beyond = (columns[0], W - 1 - columns[-1], rows[0], H - 1 - rows[-1])
-    return layer(x[inside], mask[inside]), beyond
+    planes = layer(x[inside], mask[inside])
+    return tuple(F.pad(plane, beyond, value=missing_value) for plane in planes)
 
 
 def to_grey(image: Tensor) -> Tensor:

@@ -236,15 +236,11 @@ class ViewMatcher(nn.Module):
     def query(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing
         pixels."""
-        return self.describe(*self._crops(images, boxes))
-
-    def _crops(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> tuple[Tensor, Tensor]:
-        """Crops (B, C, S, S) of the boxes, and their shapes (B,)."""
         settings = self.bank.settings
         boxes = as_boxes(boxes, len(images)).to(self.bank.device, torch.float32)
         crops = crop_photographs(images, boxes, size=settings.image_size, margin=settings.margin)
         sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
-        return crops, whole_box_shapes(boxes, sizes)
+        return self.describe(crops, whole_box_shapes(boxes, sizes))
 
     def features(self, crops: Tensor) -> QueryFeatures:
         """Describe (B, 1 or 3, S, S) crops of boxes, without box jitter and shapes."""
@@ -402,7 +398,7 @@ class ViewMatcher(nn.Module):
     ) -> Tensor:
         """(H,) float64 log scores of poses, each in a ``photograph`` (H,), whose pictures have
         these features (H, D), by the appearance term, minus that of the most similar view of the
-        photograph's ranking."""
+        photograph's ranking: positive if a pose is more similar than every view."""
         assert self._appearance is not None
         similarity = self._appearance.compare(query, features).cpu().double()
         raw = similarity[photograph, torch.arange(len(photograph))]
@@ -410,17 +406,12 @@ class ViewMatcher(nn.Module):
         for number, ranking in enumerate(rankings):
             mine = photograph == number
             if bool(mine.any()):
-                scores[mine] = self._appearance_gain(raw[mine], ranking.terms[Appearance.name][0])
+                views = ranking.terms[Appearance.name][0].cpu().double()
+                compared = views[views.isfinite()].expand(int(mine.sum()), -1)
+                every = torch.cat([compared, raw[mine][:, None]], dim=1)
+                log = self._appearance.term.log_score(every)
+                scores[mine] = log[:, -1] - log[:, :-1].amax(dim=1)
         return scores
-
-    def _appearance_gain(self, raw: Tensor, views: Tensor) -> Tensor:
-        """(H,) log scores of raw ones (H,), minus the largest of the views' (N,), NaN for views
-        that were not compared: positive if a pose is more similar than every view."""
-        assert self._appearance is not None
-        known = views.cpu().double()
-        known = known[known.isfinite()].expand(len(raw), -1)
-        scores = self._appearance.term.log_score(torch.cat([known, raw[:, None]], dim=1))
-        return scores[:, -1] - scores[:, :-1].amax(dim=1)
 
     @cached_property
     def describer(self) -> ViewDescriber:
