@@ -1,16 +1,10 @@
-"""What axes of symmetry and of revolution share: points of a surface, which of them a motion leaves
-on it, and the motion that brings more of them there."""
+"""What axes of symmetry and of revolution share: which points of a surface a motion leaves on it,
+and the motion that brings more of them there."""
 
 import numpy as np
-import trimesh
 from scipy.spatial import cKDTree
 
 from ..utils.arrays import Flags, Floats
-
-
-def surface_points(mesh: trimesh.Trimesh, count: int, *, seed: int = 0) -> Floats:
-    """(count, 3) random points of a surface, always the same."""
-    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
 
 
 def are_near(tree: cKDTree, points: Floats, tolerance: float) -> Flags:

@@ -6,6 +6,7 @@ import numpy as np
 from ..formats.meshes.colours import SurfaceColours as SurfaceColours
 from ..formats.meshes.colours import colours_of_parts as colours_of_parts
 from ..utils.arrays import Bytes, Floats, Indices, Singles
+from .sampling import faces_at
 
 SAMPLES = 20_000  # Points of the surface at which colours are compared
 # Colours vary if so large a fraction of the surface differs by so much, of 255, from the median: a
@@ -21,12 +22,7 @@ def colours_vary(colours: SurfaceColours, areas: Floats) -> bool:
     if not len(corners) or (not colours.textures and (corners == corners[0]).all()):
         return False
     rng = np.random.default_rng(0)
-    area = np.cumsum(areas)
-    face = (
-        np.searchsorted(area, rng.uniform(0.0, area[-1], SAMPLES))
-        .clip(max=len(area) - 1)
-        .astype(np.int32)
-    )
+    face = faces_at(areas, rng.uniform(0.0, 1.0, SAMPLES)).astype(np.int32)
     u, v = rng.uniform(0.0, 1.0, (2, SAMPLES)).astype(np.float32)
     outside = u + v > 1.0
     u[outside] = 1.0 - u[outside]

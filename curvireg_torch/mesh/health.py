@@ -6,7 +6,8 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from ..formats.meshes.source import MeshWarning
-from ..utils.arrays import Flags, Floats, Indices, Integers
+from ..utils.arrays import Flags, Indices, Integers
+from .sampling import faces_at
 
 SAMPLES = 20_000  # Points of the surface that say where it is
 # Parts that together hold less than this fraction of the surface, and lie farther from the rest
@@ -30,8 +31,9 @@ def stray_faces(mesh: trimesh.Trimesh) -> Flags:
     faces = np.asarray(mesh.faces)
     none = np.zeros(len(faces), bool)
     area = np.asarray(mesh.area_faces)
-    face = _random_faces(area)
-    points = _random_points(vertices[faces[face]])
+    face = faces_at(area, (np.arange(SAMPLES) + 0.5) / SAMPLES)
+    weights = np.random.default_rng(0).dirichlet(np.ones(3), SAMPLES)
+    points = np.einsum("nk,nkj->nj", weights, vertices[faces[face]])
     low, high = np.quantile(points, [0.5 * STRAY_FRACTION, 1.0 - 0.5 * STRAY_FRACTION], axis=0)
     size = float(np.linalg.norm(high - low))
     if not size > 0.0 or float(np.linalg.norm(mesh.extents)) < SPREAD * size:
@@ -76,19 +78,6 @@ def precision_warning(mesh: trimesh.Trimesh) -> MeshWarning | None:
         f"and export it again"
     )
     return MeshWarning("precision", text)
-
-
-def _random_faces(area: Floats) -> Integers:
-    """(N,) faces, more often the larger ones; always the same."""
-    total = np.cumsum(area)
-    places = (np.arange(SAMPLES) + 0.5) / SAMPLES * total[-1]
-    return np.asarray(np.searchsorted(total, places).clip(max=len(area) - 1))
-
-
-def _random_points(corners: Floats) -> Floats:
-    """(N, 3) points within N triangles."""
-    weights = np.random.default_rng(0).dirichlet(np.ones(3), len(corners))
-    return np.asarray(np.einsum("nk,nkj->nj", weights, corners))
 
 
 def _parts(cells: Integers, face: Integers, count: int) -> Indices:

@@ -6,8 +6,8 @@ import trimesh
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from .alignment import surface_points
 from .mesh import measure, mesh_radius, principal_rotation
+from .sampling import surface_points
 
 # Points of a surface that are reflected, and the distance from it, as a fraction of its radius,
 # within which that fraction of them lies if a mesh is its own mirror image

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from ..geometry import rotation_from_axis_angle
 from ..utils.arrays import Floats
-from .alignment import are_near, axis_of, rigid_step, surface_points
+from .alignment import are_near, axis_of, rigid_step
 from .mesh import measure, mesh_radius
+from .sampling import surface_points
 
 # Points of the surface that are compared with, and those that are turned
 POINTS = 20_000

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from ..geometry import rotation_from_axis_angle
 from ..utils.arrays import Floats
-from .alignment import are_near, axis_of, rigid_step, surface_points
+from .alignment import are_near, axis_of, rigid_step
 from .mesh import measure, mesh_radius
+from .sampling import surface_points
 
 # Random points of the surface, and how many of them are compared with all
 POINTS = 40_000

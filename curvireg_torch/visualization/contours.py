@@ -180,7 +180,7 @@ def contour_pixels(
     pose = T[None].double().cpu()
     K = K.double().cpu()
     depth = describer.hull @ pose[0, 2, :3] + pose[0, 2, 3]
-    if bool((depth > 0).all()):
+    if (depth > 0).all():
         box = boxes_around(projected(describer.hull, pose, K))
     else:
         box = torch.tensor([[0.0, 0.0, size[1], size[0]]], dtype=torch.float64)

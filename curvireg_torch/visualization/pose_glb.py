@@ -142,18 +142,16 @@ def _make_matt(tree: Fields) -> None:
 def _coloured(mesh: Mesh) -> trimesh.Trimesh:
     """The mesh with vertex colours; faces share no vertices, so that edges stay sharp."""
     faces = np.arange(mesh.faces.size).reshape(-1, 3)
-    plain = trimesh.Trimesh(mesh.vertices[mesh.faces].reshape(-1, 3), faces, process=False)
     rgb = np.full(3, 190 / 255)
     if mesh.colours is not None:
         face = np.repeat(np.arange(len(faces), dtype=np.int32), 3)
         corners = np.tile(np.eye(3, dtype=np.float32), (len(faces), 1))
         rgb = colours_at(mesh.colours, face, corners[:, 1], corners[:, 2])
     # From sRGB: the vertex colours of glTF are linear.
-    linear = linear_colours(rgb)
     rgba = np.full((faces.size, 4), 255, np.uint8)
-    rgba[:, :3] = (linear * 255).round()
-    plain.visual = trimesh.visual.ColorVisuals(plain, vertex_colors=rgba)
-    return plain
+    rgba[:, :3] = (linear_colours(rgb) * 255).round()
+    vertices = mesh.vertices[mesh.faces].reshape(-1, 3)
+    return trimesh.Trimesh(vertices, faces, vertex_colors=rgba, process=False)
 
 
 def _photograph_plane(image: Tensor, K: Tensor, depth: float) -> trimesh.Trimesh:
