@@ -25,14 +25,11 @@ BACKGROUND_DEPTH = 1.25
 MIN_RELATIVE_RANGE = 1e-6
 
 
-def _visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _visible_range(depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Depth with missing pixels at the largest number; nearest depth and depth range of each image,
-    (B, 1, 1, 1). Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of
-    rounding, which must not be stretched, the largest depth is returned instead. The range of an
-    empty image is 1."""
+    (B, 1, 1, 1). Missing pixels are 0, negative, inf or NaN. For a range of rounding, which must
+    not be stretched, the largest depth is returned instead. The range of an empty image is 1."""
     clean = depth.nan_to_num(0.0, 0.0, 0.0)
-    if mask is not None:
-        clean = torch.where(mask, clean, 0.0)
     far = clean.amax(dim=(1, 2, 3), keepdim=True)
     visible = far > 0
     surface = F.threshold(clean, 0.0, torch.finfo(depth.dtype).max)
@@ -60,6 +57,7 @@ def apply_to_depth(
     check_image(depth, "depth")
     scale = None if depth_scale is None else check_positive(depth_scale, "depth_scale")
     checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
+    seen = ops.at_least_float32(depth)
     if mask is not None:
         fits = mask.ndim <= 4 and all(
             m in (1, n) for m, n in zip(mask.shape[::-1], depth.shape[::-1], strict=False)
@@ -69,10 +67,10 @@ def apply_to_depth(
                 f"mask: expected bool of shape {tuple(depth.shape)}, got {type_and_shape(mask)}"
             )
         check_same_device(mask, depth, "mask")
-        mask = mask.expand(depth.shape)
+        seen = torch.where(mask, seen, 0.0)
 
-    def on_surface(depth: Tensor, mask: Tensor | None, *cameras: Tensor) -> ops.Planes:
-        surface, near, span = _visible_range(depth, mask)
+    def on_surface(depth: Tensor, *cameras: Tensor) -> ops.Planes:
+        surface, near, span = _visible_range(depth)
         if cameras:
             z = torch.minimum(surface, near + BACKGROUND_DEPTH * span) / span
         else:
@@ -82,9 +80,7 @@ def apply_to_depth(
         return layer(ops.smooth(z, checked_sigma, linear=True), *cameras)
 
     cameras = () if camera_matrix is None else (camera_matrix,)
-    return ops.apply_in_blocks(on_surface, ops.at_least_float32(depth), mask, *cameras).to(
-        depth.dtype
-    )
+    return ops.apply_in_blocks(on_surface, seen, *cameras).to(depth.dtype)
 
 
 def depth_curvilinear_saliency(

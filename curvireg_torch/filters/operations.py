@@ -93,16 +93,15 @@ Planes = tuple[Tensor, ...]
 BLOCK_PIXELS = 2**18  # that a layer gets at once, so that intermediate results stay in the cache
 
 
-def apply_in_blocks(layer: Callable[..., Planes], *tensors: Tensor | None) -> Tensor:
+def apply_in_blocks(layer: Callable[..., Planes], *tensors: Tensor) -> Tensor:
     """``stack_channels(*layer(*tensors))`` of a layer that treats images independently, in blocks
     on a CPU."""
     x = tensors[0]
-    assert x is not None
     if torch.compiler.is_compiling() or x.device.type != "cpu" or x.numel() <= BLOCK_PIXELS:
         return stack_channels(*layer(*tensors))
     size = max(1, BLOCK_PIXELS // x.shape[1:].numel())
-    parts = [[None] * math.ceil(len(x) / size) if t is None else t.split(size) for t in tensors]
-    return torch.cat([stack_channels(*layer(*part)) for part in zip(*parts, strict=True)])
+    parts = zip(*(tensor.split(size) for tensor in tensors), strict=True)
+    return torch.cat([stack_channels(*layer(*part)) for part in parts])
 
 
 def stack_channels(*planes: Tensor) -> Tensor:
@@ -146,7 +145,7 @@ def apply_to_photograph(
 def _has_empty_border(mask: Tensor) -> bool:
     """Whether the first or the last row or column of an image is missing."""
     sides = (mask[..., 0, :], mask[..., -1, :], mask[..., 0], mask[..., -1])
-    return any(bool(side.all(dim=-1).any()) for side in sides)
+    return any(side.all(dim=-1).any() for side in sides)
 
 
 def _on_inside(
