@@ -13,6 +13,7 @@ from ..filters.operations import resized
 from ..geometry.crops import crop_transforms, non_maximum_suppression, square_boxes
 from ..geometry.pose_prior import check_distance
 from ..utils.checks import check_photograph, check_pixels
+from ..utils.rows import Rows
 from . import ViewBank, ViewMatcher
 
 TEMPLATE_SIDE = 96  # Side of the template views in px
@@ -26,7 +27,7 @@ MEDOID_ROUNDS = 10  # Largest number of rounds of k-medoids
 
 
 @dataclass(frozen=True)
-class Proposals:
+class Proposals(Rows):
     """Boxes of one photograph, best first.
 
     Attributes:
@@ -229,28 +230,20 @@ class Detector(nn.Module):
         every = torch.cat([m.flatten(1) for m in maps], dim=1)
         mean = every.mean(dim=1)
         spread = every.std(dim=1).clamp(min=1e-6)
-        boxes = []
-        responses = []
-        views = []
+        parts = []
         for similarity, fits, ratio in zip(maps, fitting, ratios, strict=True):
             z = (similarity - mean[:, None, None]) / spread[:, None, None]
             best, view = z.masked_fill(~fits[:, None, None], -torch.inf).max(dim=0)
             peak = (best == F.max_pool2d(best[None], 3, stride=1, padding=1)[0]) & best.isfinite()
             i, j = peak.nonzero(as_tuple=True)
             corner = torch.stack([j, i], dim=1).repeat(1, 2) * 8.0 - TEMPLATE_SIDE / 2.0
-            boxes.append(
-                (self._boxes[view[i, j]] + corner) / best.new_tensor([*ratio, *ratio]) - 0.5
-            )
-            responses.append(best[i, j])
-            views.append(self._views[view[i, j].cpu()])
-        response, index = torch.cat(responses).sort(descending=True, stable=True)
-        index = index[:MAX_PEAKS]
-        box = torch.cat(boxes)[index]
-        view = torch.cat(views)[index.cpu()]
-        kept = non_maximum_suppression(box, response[:MAX_PEAKS], SAME_OBJECT_OVERLAP)[
-            : self.settings.proposals
-        ]
-        return Proposals(box[kept].cpu(), response[kept].cpu(), view[kept.cpu()])
+            box = (self._boxes[view[i, j]] + corner) / best.new_tensor([*ratio, *ratio]) - 0.5
+            part = Proposals(box.cpu(), best[i, j].cpu(), self._views[view[i, j].cpu()])
+            parts.append(part)
+        found = Proposals.cat(parts)
+        found = found[found.responses.argsort(descending=True, stable=True)[:MAX_PEAKS]]
+        kept = non_maximum_suppression(found.boxes, found.responses, SAME_OBJECT_OVERLAP)
+        return found[kept[: self.settings.proposals]]
 
 
 def _representative_views(bank: ViewBank, count: int) -> Tensor:
