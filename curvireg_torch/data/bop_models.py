@@ -44,11 +44,8 @@ class BOPModels:
             self.info = read_models_info(table)
             self._check_unit()
         elif self.files:
-            self.info = {
-                number: self._measured(number)
-                for number in self.files
-                if self.hull(number) is not None
-            }
+            hulls = {number: self.hull(number) for number in self.files}
+            self.info = {n: _measured(hull) for n, hull in hulls.items() if hull is not None}
         else:
             raise MissingFileError(
                 f"neither models_info.json nor obj_000001.ply; {README} shows the layout",
@@ -77,31 +74,14 @@ class BOPModels:
             vertices = mesh.vertices
         return torch.from_numpy(np.array(vertices, dtype=np.float64))
 
-    def diameter(self, number: int) -> float | None:
-        """The largest distance of two vertices, or None without a readable mesh."""
-        hull = self.hull(number)
-        if hull is None:
-            return None
-        step = -(-len(hull) // MAX_HULL_POINTS)
-        return float(pdist(hull[::step].numpy()).max())
-
-    def _measured(self, number: int) -> Fields:
-        """An entry as models_info.json has it, without symmetries."""
-        hull = self.hull(number)
-        assert hull is not None
-        low = hull.amin(dim=0).tolist()
-        size = (hull.amax(dim=0) - hull.amin(dim=0)).tolist()
-        sides = {f"min_{axis}": value for axis, value in zip("xyz", low, strict=True)}
-        sides |= {f"size_{axis}": value for axis, value in zip("xyz", size, strict=True)}
-        return {"diameter": self.diameter(number), **sides}
-
     def _check_unit(self) -> None:
         """Refuse meshes in another unit than the diameters: of all, the first that can be read is
         measured."""
         for number in sorted(self.info.keys() & self.files.keys()):
-            measured = self.diameter(number)
-            if measured is None:
+            hull = self.hull(number)
+            if hull is None:
                 continue
+            measured = _diameter(hull)
             listed = float(self.info[number]["diameter"])
             if not 1.0 / MAX_UNIT_FACTOR < measured / listed < MAX_UNIT_FACTOR:
                 metres = "in metres? " if 500 < listed / measured < 2000 else ""
@@ -111,6 +91,21 @@ class BOPModels:
                 )
                 raise InvalidInputError(message, subject=self.files[number])
             return
+
+
+def _diameter(hull: Tensor) -> float:
+    """The largest distance of two vertices (V, 3)."""
+    step = -(-len(hull) // MAX_HULL_POINTS)
+    return float(pdist(hull[::step].numpy()).max())
+
+
+def _measured(hull: Tensor) -> Fields:
+    """An entry as models_info.json has it, without symmetries."""
+    low = hull.amin(dim=0).tolist()
+    size = (hull.amax(dim=0) - hull.amin(dim=0)).tolist()
+    sides = {f"min_{axis}": value for axis, value in zip("xyz", low, strict=True)}
+    sides |= {f"size_{axis}": value for axis, value in zip("xyz", size, strict=True)}
+    return {"diameter": _diameter(hull), **sides}
 
 
 def model_files(folder: Path) -> dict[int, Path]:

@@ -1,6 +1,6 @@
 """Calibration files as cameras of the library."""
 
-import torch
+from dataclasses import asdict
 
 from ..errors import InvalidInputError
 from ..formats.cameras import CameraFiles
@@ -37,13 +37,6 @@ class Calibrations(CameraFiles):
         """:func:`load_camera`."""
         record = self.read(path)
         try:
-            return Camera(
-                torch.tensor(record.matrix, dtype=torch.float64),
-                record.distortion,
-                record.model,
-                record.size,
-                focal_deviation=record.focal_deviation,
-                source=record.source,
-            )
+            return Camera(**asdict(record))
         except InvalidInputError as error:
             raise InvalidInputError(str(error), subject=path, kind="calibration") from error
