@@ -282,7 +282,10 @@ class ViewBank:
             arrays[f"{kind}.faces"] = np.array(surface.faces, np.int32)
         contents |= {name: torch.from_numpy(x.copy()) for name, x in arrays.items()}
         contents["extreme_points"] = extreme_points(self.mesh)
-        contents["reflection_plane"] = _rows(reflection_plane(self.mesh))
+        plane = reflection_plane(self.mesh)
+        contents["reflection_plane"] = (
+            torch.zeros(0, 3, dtype=torch.float64) if plane is None else plane[None]
+        )
         if not self.mesh.has_colours:
             contents["mesh_symmetries"] = mesh_symmetries(self.mesh)
         angle = self._compared_angle()
@@ -304,12 +307,8 @@ class ViewBank:
     def _compared_angle(self) -> float | None:
         """How far apart the views are that a photograph's appearance is compared with; None if it
         is compared with all, or with none."""
-        angles = [
-            term.min_angle
-            for term in self.pipeline.terms
-            if isinstance(term, Appearance) and len(self) > term.exhaustive_limit
-        ]
-        return angles[0] if angles else None
+        terms = (term for term in self.pipeline.terms if isinstance(term, Appearance))
+        return next((term.min_angle for term in terms if len(self) > term.exhaustive_limit), None)
 
     @classmethod
     def load(cls, path: PathName, *, device: torch.device | str = "cpu") -> "ViewBank":
@@ -447,23 +446,16 @@ def _check_extreme_points(mesh: Mesh) -> None:
     if points.dtype != torch.float64:
         raise ValueError("extreme_points: expected float64")
     check_finite(points, "extreme_points")
-    bounds = (
-        torch.stack([points.amin(dim=0), points.amax(dim=0)])
-        if len(points)
-        else torch.full((2, 3), torch.nan)
-    )
-    gap = (bounds - torch.from_numpy(np.array(mesh.bounds))).abs().max()
-    if not float(gap) <= EXTREME_TOLERANCE * mesh_radius(mesh):
+    tolerance = EXTREME_TOLERANCE * mesh_radius(mesh)
+    if not len(points) or not np.allclose(
+        torch.stack(points.aminmax(dim=0)), mesh.bounds, rtol=0.0, atol=tolerance
+    ):
         raise ValueError("extreme_points: those of another mesh")
 
 
-def _rows(plane: Tensor | None) -> Tensor:
-    """(1, 3) normal of a plane, (0, 3) for none."""
-    return torch.zeros(0, 3, dtype=torch.float64) if plane is None else plane[None]
-
-
 def _plane(rows: Tensor) -> Tensor | None:
-    """The plane of :func:`_rows`; ValueError for what is none."""
+    """The normal (3,) of a plane, (1, 3) in a file, or none, (0, 3); ValueError for what is
+    neither."""
     check_tensor(rows, "reflection_plane", (None, 3))
     lengths = torch.linalg.vector_norm(rows.double(), dim=1)
     if rows.dtype != torch.float64 or not torch.allclose(lengths, lengths.new_ones(len(rows))):
@@ -476,12 +468,8 @@ def colour_arrays(mesh: Mesh) -> dict[str, Array]:
     colours = mesh.colours
     if colours is None:
         return {}
-    arrays: dict[str, Array] = {
-        "corners": colours.corners,
-        "uv": colours.uv,
-        "texture": colours.texture,
-    }
-    arrays |= {f"picture{k}": texture for k, texture in enumerate(colours.textures)}
+    arrays = dict(vars(colours))
+    arrays |= {f"picture{k}": texture for k, texture in enumerate(arrays.pop("textures"))}
     return {f"colours.{name}": x for name, x in arrays.items()}
 
 
@@ -504,12 +492,12 @@ def _check_contents(
         x = tensors[name]
         # A sum in float32 is finite if all half-precision values are, and fast.
         if x.shape != (N, width) or (
-            x.is_floating_point() and not bool(x.sum(dtype=torch.float32).isfinite())
+            x.is_floating_point() and not x.sum(dtype=torch.float32).isfinite()
         ):
             raise ValueError(f"{name}: not of the shape that the settings say, or not finite")
     if any(tensors[name].dtype != torch.uint8 for name in ("points", "silhouettes")):
         raise ValueError("points, silhouettes: expected uint8")
-    if not all(bool(x.isfinite().all()) for x in views.columns().values()):
+    if not all(x.isfinite().all() for x in views.columns().values()):
         raise ValueError("viewpoints that are not finite")
     if (
         not tensors["descriptors"].any()

@@ -156,7 +156,8 @@ def cached_bank(
         mesh.measures.update(bank.mesh.measures)
         bank.mesh = mesh
     bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
-    bank.described_views_file = _described_views_file(path) if bank.device.type == "cpu" else None
+    views_file = path.with_name(path.name.replace("bank-", "views-"))
+    bank.described_views_file = views_file if bank.device.type == "cpu" else None
     if is_new:
         _store(bank, path)
     return bank
@@ -196,11 +197,6 @@ def clear_cache(folder: Path | None = None) -> int:
     for file in files:
         file.path.unlink(missing_ok=True)
     return sum(map(_is_bank, files))
-
-
-def _described_views_file(bank: Path) -> Path:
-    """The file with features of the views of a cached bank."""
-    return bank.with_name(bank.name.replace("bank-", "views-"))
 
 
 def _is_bank(file: CachedBank) -> bool:

@@ -131,9 +131,7 @@ class DescribedViews:
         """(U, D) features of views; those that are not known are described by ``describe``, which
         returns the float16 features of a list of views."""
         self._read()
-        known = {
-            view: feature for view in views if (feature := self._features.get(view)) is not None
-        }
+        known = {view: self._features[view] for view in views if view in self._features}
         missing = [view for view in views if view not in known]
         if missing:
             described = dict(zip(missing, describe(missing), strict=True))

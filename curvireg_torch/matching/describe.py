@@ -142,8 +142,6 @@ class ViewDescriber:
         T, K, _ = self.cameras(rotations, distances)
         if self._orthographic:
             z = distances.double().cpu()
-            T = T.clone()
-            K = K.clone()
             T[:, 2, 3] += PARALLEL_DISTANCE * z
             K[:, :2, :2] *= (1.0 + PARALLEL_DISTANCE) * z[:, None, None]
         squares = square_boxes(boxes.double().cpu(), self.settings.margin)
@@ -233,7 +231,7 @@ class ViewDescriber:
         field = self.field(depth, K)
         points = field_points(field, fraction=self.settings.point_fraction)[:, 0]
         silhouettes = depth[:, 0] > 0
-        if bool(rendered.all()):
+        if rendered.all():
             descriptors = self.descriptor(field)
         else:
             selected = quarters.to(self._device), (rendered.cumsum(0) - 1)[source].to(self._device)

@@ -180,8 +180,8 @@ class ViewMatcher(nn.Module):
 
     @cached_property
     def _described_views(self) -> DescribedViews:
-        """Of a cached bank kept in a file for the renderer, as others draw other pictures; those of
-        a custom one, whose name says nothing, are not kept."""
+        """Features of views. Those of a cached bank are kept in a file for its pictures by this
+        renderer; others draw others. The name of a custom one says nothing: its are not kept."""
         shared = self.bank.described_views_file
         if shared is None or not isinstance(self._renderer, str):
             return DescribedViews(None)
@@ -405,7 +405,7 @@ class ViewMatcher(nn.Module):
         scores = torch.zeros_like(raw)
         for number, ranking in enumerate(rankings):
             mine = photograph == number
-            if bool(mine.any()):
+            if mine.any():
                 views = ranking.terms[Appearance.name][0].cpu().double()
                 compared = views[views.isfinite()].expand(int(mine.sum()), -1)
                 every = torch.cat([compared, raw[mine][:, None]], dim=1)
