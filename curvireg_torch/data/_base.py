@@ -101,7 +101,8 @@ class ObjectDataset(Dataset[Sample]):
         if self.target_transform is not None:
             sample = self.target_transform(sample)
         pixels = image if self.transform is None else self.transform(image)
-        if _is_of_another_size(pixels, image):
+        is_picture = isinstance(pixels, Tensor) and pixels.ndim >= 2
+        if is_picture and pixels.shape[-2:] != image.shape[-2:]:
             raise InvalidInputError(
                 f"transform: made {tuple(pixels.shape)} of a photograph {tuple(image.shape)}, "
                 "whose box, camera and pose do not follow; change the size by transforms=, a "
@@ -122,11 +123,6 @@ class ObjectDataset(Dataset[Sample]):
         if not -len(self) <= number < len(self):
             raise IndexError(f"{type(self).__name__}: has {len(self)} objects, got index {number}")
         return number
-
-
-def _is_of_another_size(pixels: Any, image: Tensor) -> bool:
-    """Whether the result of a transform is a picture of another height or width."""
-    return isinstance(pixels, Tensor) and pixels.ndim >= 2 and pixels.shape[-2:] != image.shape[-2:]
 
 
 def existing_root(root: PathName, readme: str) -> Path:

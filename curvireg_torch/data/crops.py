@@ -93,7 +93,7 @@ class ObjectCrops(Dataset[dict[str, Tensor]]):
         self.margin = margin
         self.bins = tuple(bins)
         self.transform = transform
-        names = [_class_of(item) for item in dataset._items]
+        names = [str(item.get("category", item.get("obj_id"))) for item in dataset._items]
         self.classes = sorted(set(names), key=_numeric_order)
         class_ids = {name: number for number, name in enumerate(self.classes)}
         self._class_ids = [class_ids[name] for name in names]
@@ -141,7 +141,7 @@ crops = ObjectCrops
 def viewpoint_bins(rotation: Tensor, bins: Sequence[int]) -> Tensor:
     """(3,) int64 bins of azimuth, elevation and theta of a rotation (3, 3); -100 for an unknown
     one."""
-    if not bool(rotation.isfinite().all()):
+    if not rotation.isfinite().all():
         return torch.full((len(_ANGLES),), UNKNOWN_CLASS)
     # not as annotated, where an elevation may lie past the pole
     viewpoint = torch.stack(viewpoint_from_rotation(rotation.double()))
@@ -158,10 +158,6 @@ def _reason_to_leave_out(item: Sample) -> str | None:
     if not all(map(math.isfinite, item["box"])):
         return "unknown_box"
     return "invisible" if item.get("visib_fract") == 0.0 else None
-
-
-def _class_of(item: Sample) -> str:
-    return str(item["category"] if "category" in item else item["obj_id"])
 
 
 def _numeric_order(name: str) -> tuple[int, str]:

@@ -72,7 +72,7 @@ def _hog(
         )
     if bin_weights is not None:
         check_tensor(bin_weights, "bin_weights", (bins,))
-        if ops.is_host_readable(bin_weights) and not bool((bin_weights >= 0).all()):
+        if ops.is_host_readable(bin_weights) and not (bin_weights >= 0).all():
             raise InvalidInputError(
                 f"bin_weights: expected factors >= 0, got {bin_weights.tolist()}"
             )
@@ -243,7 +243,7 @@ def strongest_points(response: Tensor, candidates: Tensor, fraction: float) -> T
         return candidates
     candidates = candidates & (response > 0)
     count = max(1, int(fraction * H * W))
-    if ops.is_host_readable(response) and not bool((candidates.sum(dim=(1, 2, 3)) > count).any()):
+    if ops.is_host_readable(response) and not (candidates.sum(dim=(1, 2, 3)) > count).any():
         return candidates  # most views have fewer, and topk is slow
     limit = (
         torch.where(candidates, response, 0.0)

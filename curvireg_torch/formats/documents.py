@@ -77,12 +77,10 @@ def _text(data: bytes, expected: str) -> str:
     try:
         return data.decode(encoding)
     except UnicodeDecodeError as error:
-        message = (
+        raise InvalidInputError(
             "not a text file, and pickle is not read; save it as JSON: "
             "json.dump({'camera_matrix': K.tolist(), "
-        )
-        raise InvalidInputError(
-            f"{message}'dist_coeffs': D.tolist()}}, file); expected {expected}"
+            f"'dist_coeffs': D.tolist()}}, file); expected {expected}"
         ) from error
 
 
@@ -112,12 +110,10 @@ def _arrays(data: bytes) -> Fields:
         if not data.startswith(b"PK"):
             return {"K": _array(data)}
         with zipfile.ZipFile(BytesIO(data)) as archive:
-            members = archive.infolist()[:MAX_ARRAYS]
-            small = [member for member in members if member.file_size <= MAX_ARRAY_BYTES]
             return {
                 member.filename.removesuffix(".npy"): _array(archive.read(member))
-                for member in small
-                if member.filename.endswith(".npy")
+                for member in archive.infolist()[:MAX_ARRAYS]
+                if member.file_size <= MAX_ARRAY_BYTES and member.filename.endswith(".npy")
             }
     except Exception as error:  # both libraries raise errors of any kind for damaged files
         raise InvalidInputError("a damaged .npz or .npy; save it again with numpy.savez") from error

@@ -136,7 +136,7 @@ def picture_metadata(image: "Image", data: bytes = b"") -> Metadata:
             focal = zoom * _focal_by_sensor(directory, size)
             zoom = 1.0
     valid = isinstance(orientation, int) and orientation in range(1, 9)
-    found = image.info.get("xmp", b"")  # where Pillow looks for it
+    found = image.info.get("xmp", b"")  # that Pillow has found
     xmp = found if isinstance(found, bytes) else str(found).encode()
     return Metadata(
         orientation if valid else 1,

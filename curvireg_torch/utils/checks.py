@@ -166,7 +166,7 @@ def check_integer(value: Any, name: str, *, least: int = 1) -> int:
 
 def check_finite(x: Tensor, name: str) -> None:
     """``x`` has no NaN and no inf."""
-    if not bool(x.isfinite().all()):
+    if not x.isfinite().all():
         raise InvalidInputError(f"{name}: expected finite entries, got NaN or inf")
 
 
@@ -231,14 +231,14 @@ def check_camera_matrix(K: Tensor, name: str = "camera matrix") -> None:
     if not isinstance(K, Tensor) or tuple(K.shape[-2:]) != (3, 3) or not K.is_floating_point():
         raise InvalidInputError(f"{name}: expected floating (..., 3, 3), got {type_and_shape(K)}")
     check_finite(K, name)
-    if not bool((K[..., 0, 0] > 0).all() and (K[..., 1, 1] > 0).all()):
+    if not ((K[..., 0, 0] > 0).all() and (K[..., 1, 1] > 0).all()):
         raise InvalidInputError(
             f"{name}: expected focal lengths FX, FY > 0 (in pixels); check their order FX FY CX CY"
         )
     last = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
-    if not bool((K[..., 2, :] == last).all() and (K[..., 1, 0] == 0).all()):
+    if not ((K[..., 2, :] == last).all() and (K[..., 1, 0] == 0).all()):
         raise InvalidInputError(f"{name}: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    if not bool((K[..., 0, 1].abs() <= 1e-6 * K[..., 0, 0]).all()):  # rounding may leave this
+    if not (K[..., 0, 1].abs() <= 1e-6 * K[..., 0, 0]).all():  # rounding may leave this
         raise InvalidInputError(f"{name}: expected no skew, K[0, 1] = 0; rectify the image")
 
 
@@ -292,7 +292,7 @@ def check_numbers(values: Any, name: str, count: int | None = None) -> Tensor:
     numbers = as_numbers(
         list(values) if isinstance(values, range) else values, name, dtype=torch.float64
     ).flatten()
-    if len(numbers) != (count or max(1, len(numbers))) or not bool(numbers.isfinite().all()):
+    if len(numbers) != (count or max(1, len(numbers))) or not numbers.isfinite().all():
         raise InvalidInputError(
             f"{name}: expected {count or 'at least one'} finite numbers, got {values!r:.80}"
         )

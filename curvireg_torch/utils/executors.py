@@ -370,12 +370,12 @@ def _answer(
             raised.add_note(traceback.format_exc())
             results = ()
             error = raised
-    ours = [(one.category, str(one.message)) for one in caught if _is_ours(one.category)]
+    ours = [
+        (one.category, str(one.message))
+        for one in caught
+        if one.category is UserWarning or issubclass(one.category, CurviregWarning)
+    ]
     return _Answer(results, ours, error)
-
-
-def _is_ours(category: type[Warning]) -> bool:
-    return category is UserWarning or issubclass(category, CurviregWarning)
 
 
 def _multiplied(factor: int, numbers: Sequence[int]) -> list[int]:

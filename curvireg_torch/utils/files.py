@@ -269,16 +269,12 @@ def read_csv(path: Path) -> list[list[str]]:
         rows = [cells for cells in table if any(map(str.strip, cells))]
         if separator == ",":
             return rows
-        return [[_with_decimal_points(cell) for cell in cells] for cells in rows]
+        are_numbers = _DECIMAL_COMMAS.fullmatch
+        return [[c.replace(",", ".") if are_numbers(c) else c for c in cells] for cells in rows]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InvalidInputError(
             f"not CSV in UTF-8 ({error}); save it as CSV in UTF-8", subject=path
         ) from error
-
-
-def _with_decimal_points(cell: str) -> str:
-    """A cell of numbers with decimal commas, with points; any other one as it is."""
-    return cell.replace(",", ".") if _DECIMAL_COMMAS.fullmatch(cell) else cell
 
 
 _SEPARATOR_LINE = re.compile(r"sep=([,;\t])\r?\n")  # the first one, of Excel

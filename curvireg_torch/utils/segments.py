@@ -40,8 +40,5 @@ def best_within(scores: Tensor, segment: Tensor) -> Tensor:
         >>> best_within(torch.tensor([1.0, 3.0, 2.0]), torch.tensor([1, 0, 1])).tolist()
         [1, 2]
     """
-    order = order_within(scores, segment)
-    ordered = segment[order]
-    is_first = torch.ones_like(ordered, dtype=torch.bool)
-    is_first[1:] = ordered[1:] != ordered[:-1]
-    return order[is_first]
+    best = (place_within(scores, segment) == 0).nonzero()[:, 0]
+    return best[segment[best].argsort()]

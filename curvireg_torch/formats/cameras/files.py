@@ -173,7 +173,8 @@ def _found(value: Any, path: tuple[str, ...], around: tuple[Document, ...]) -> I
     if not isinstance(value, dict):
         return
     record = Record(value, set())
-    kind = next((kind for kind in FORMATS if kind.detect(record)), None)
+    kinds = (kind for kind in FORMATS if record.matches(kind.keys) and kind.also(record))
+    kind = next(kinds, None)
     if kind is not None:
         yield _Found(path, value, around, kind)
     for key, inside in value.items():

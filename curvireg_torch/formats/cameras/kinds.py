@@ -118,10 +118,6 @@ class Format:
     inherits: bool = False
     also: Callable[[Record], bool] = lambda _: True
 
-    def detect(self, record: Record) -> bool:
-        """Whether a dict of a file is a camera of this format."""
-        return record.matches(self.keys) and self.also(record)
-
 
 def _camera_from(
     matrix: Sequence[float],

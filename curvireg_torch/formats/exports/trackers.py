@@ -1,6 +1,6 @@
 """A start pose and the mesh as other trackers read them: M3T (and pym3t), and ViSP; in metres."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -98,13 +98,14 @@ def write_visp(out: Path, vertices: Floats, faces: Integers, document: Document)
     ]
     _write_lines(out / "object.cao", cao)
     some = points[_spread(points, INIT_POINTS)]
+    seen = transform_points(some, T) @ np.array(document["camera"]["matrix"]).T
     init = [
         "# 3D points, in metres",
         str(len(some)),
         *(f"{x:.9g} {y:.9g} {z:.9g}" for x, y, z in some),
         "# 2D points: row and column, in pixels",
         str(len(some)),
-        *(f"{v:.6f} {u:.6f}" for u, v in _pixels(some, T, document["camera"]["matrix"])),
+        *(f"{v:.6f} {u:.6f}" for u, v in seen[:, :2] / seen[:, 2:]),
     ]
     _write_lines(out / "object.init", init)
     turn = Rotation.from_quat(document["quaternion"], scalar_first=True).as_rotvec()
@@ -125,12 +126,6 @@ def _pose_in_metres(document: Document, name: str) -> tuple[Floats, float]:
     T[:3, :3] = document["rotation"]
     T[:3, 3] = metres * np.array(document["translation"])
     return T, metres
-
-
-def _pixels(points: Floats, T: Floats, K: Sequence[Sequence[float]]) -> Floats:
-    """(N, 2) pixels of points (N, 3)."""
-    seen = transform_points(points, T) @ np.array(K).T
-    return np.asarray(seen[:, :2] / seen[:, 2:])
 
 
 def _spread(points: Floats, count: int) -> list[int]:
