@@ -18,8 +18,7 @@ from tqdm import tqdm
 from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
 from ..features.whitening import Precision, Whitening, ledoit_wolf
 from ..geometry.viewpoint import ViewSphere, up_rotation
-from ..mesh import Mesh, MeshWarning, mesh_symmetries
-from ..mesh.colours import SurfaceColours
+from ..mesh import Mesh, MeshWarning, SurfaceColours, mesh_symmetries
 from ..mesh.mesh import (
     as_mesh,
     checked_triangles,

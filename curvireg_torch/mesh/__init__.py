@@ -1,7 +1,7 @@
 """Meshes: files of several formats become one clean surface with its unit, up axis and colours."""
 
+from ..formats.meshes.colours import SurfaceColours
 from ..formats.meshes.source import MeshWarning
-from .colours import SurfaceColours
 from .mesh import (
     Mesh,
     as_mesh,

@@ -3,8 +3,7 @@
 import cv2
 import numpy as np
 
-from ..formats.meshes.colours import SurfaceColours as SurfaceColours
-from ..formats.meshes.colours import colours_of_parts as colours_of_parts
+from ..formats.meshes.colours import SurfaceColours
 from ..utils.arrays import Bytes, Floats, Indices, Singles
 from .sampling import faces_at
 

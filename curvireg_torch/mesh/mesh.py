@@ -21,6 +21,7 @@ from ..errors import (
     CurviregWarning,
     MeshError,
 )
+from ..formats.meshes.colours import SurfaceColours, colours_of_parts
 from ..formats.meshes.files import read_mesh
 from ..formats.meshes.scenes import joined_scene
 from ..formats.meshes.source import MeshWarning
@@ -29,7 +30,7 @@ from ..utils.arrays import Flags, Floats, Integers
 from ..utils.checks import check_option
 from ..utils.choices import UNITS, UP_AXES, unit_of_length
 from ..utils.likes import MeshLike
-from .colours import SurfaceColours, colours_of_parts, colours_vary
+from .colours import colours_vary
 from .health import precision_warning, stray_faces, stray_warning
 
 Value = TypeVar("Value")
@@ -280,7 +281,7 @@ def checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[Integers, Flags
         raise MeshError(
             f"{count} faces have NaN or infinite vertices; repair the mesh", subject=name
         )
-    if float(np.abs(corners).max()) > MAX_MESH_COORDINATE:
+    if np.abs(corners).max() > MAX_MESH_COORDINATE:
         raise MeshError(
             f"vertices farther than {MAX_MESH_COORDINATE:g} from the origin; repair the mesh",
             subject=name,

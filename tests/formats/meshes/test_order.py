@@ -14,10 +14,9 @@ from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import CurviregWarning
-from curvireg_torch.formats.meshes.colours import texture_pixels
+from curvireg_torch.formats.meshes.colours import colours_of_parts, texture_pixels
 from curvireg_torch.formats.meshes.polygons import triangulated
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, colour_bytes
-from curvireg_torch.mesh.colours import colours_of_parts
 from curvireg_torch.utils.extras import is_installed
 from tests._support.tables import text_table
 from tests.formats.meshes.packages import solid, threemf
