@@ -1,6 +1,7 @@
 """Folders of the user: objects, each with a mesh and photographs of known or unknown pose."""
 
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Unpack
 
@@ -76,14 +77,12 @@ class PoseFolder(ObjectDataset):
         table = folder / "views.csv"
         if not table.is_file():
             return self._skip("missing_annotation", f"{folder.name}/views.csv")
-        try:
-            header, *lines = ([cell.strip() for cell in line] for line in read_csv(table))
-        except ValueError:  # damaged, or empty
-            header = []
-            lines = []
-        if header != _COLUMNS:
+        lines = []
+        with suppress(ValueError):  # damaged
+            lines = [[cell.strip() for cell in line] for line in read_csv(table)]
+        if lines[:1] != [_COLUMNS]:
             return self._skip("corrupt_annotation", f"{folder.name}/views.csv")
-        for index, line in enumerate(lines):
+        for index, line in enumerate(lines[1:]):
             ids = {"category": folder.name, "mesh_path": str(meshes[0]), "object_index": index}
             self._add(_parse(line, folder), f"{folder.name}/views.csv #{index}", **ids)
         return None

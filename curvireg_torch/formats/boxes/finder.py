@@ -213,19 +213,16 @@ class BoxFile:
         levels = zip(*map(_folders, self._images), strict=False)
         return sum(1 for _ in takewhile(lambda level: len(set(level)) == 1, levels))
 
-    def _distinguishing_folders(self, image: str) -> int:
-        """Number of folders of an image that those around a photograph must match."""
-        folders = _folders(image)
-        return len(folders) - (0 if ANY_FOLDER in folders else self._common_folders)
-
     def _image(self, photo: Path) -> tuple[str, bool]:
         """The image of a file that is a photograph, and whether one of its folders says so."""
         around = _folders(os.path.abspath(photo))
         for name in (photo.name, photo.stem, without_zeros(photo.stem)):
             counts = {}
             for image in self._names.get(name, []):
-                count = _matching(_folders(image), around)
-                if count >= self._distinguishing_folders(image):
+                folders = _folders(image)
+                in_common = 0 if ANY_FOLDER in folders else self._common_folders
+                count = _matching(folders, around)
+                if count >= len(folders) - in_common:  # all that distinguish images
                     counts[image] = count
             most = max(counts.values(), default=0)
             chosen = [image for image, count in counts.items() if count == most]

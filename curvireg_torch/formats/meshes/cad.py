@@ -5,6 +5,7 @@ import re
 import tempfile
 import warnings
 from dataclasses import replace
+from functools import cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -177,15 +178,12 @@ def _check_copies(root: Any) -> None:
     are counted first."""
     named = {f"#{one.get('id')}": one for one in root.iter() if one.get("id")}
     known: dict[Any, tuple[int, int]] = {}
-    faces_of: dict[str, int] = {}
 
+    @cache
     def faces(url: str) -> int:
-        if url not in faces_of:
-            own = named.get(url, ())
-            skins = [str(one.get("source")) for one in own if local_name(one) in ("skin", "morph")]
-            shapes = [own, *(named.get(skin, ()) for skin in skins)]
-            faces_of[url] = sum(map(_most_faces, shapes))
-        return faces_of[url]
+        own = named.get(url, ())
+        skins = [str(one.get("source")) for one in own if local_name(one) in ("skin", "morph")]
+        return sum(map(_most_faces, [own, *(named.get(skin, ()) for skin in skins)]))
 
     def count(node: Any, depth: int) -> tuple[int, int]:
         """The parts and faces below a node."""
