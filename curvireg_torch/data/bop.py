@@ -224,7 +224,7 @@ class BOPDataset(ObjectDataset):
         if hull is None:
             return _UNKNOWN_BOX
         R, t, K = (torch.tensor(numbers, dtype=torch.float64) for numbers in pose_and_camera)
-        if float((hull @ R.T + t)[:, 2].min()) <= 0:
+        if (hull @ R.T + t)[:, 2].min() <= 0:
             return None
         return tuple(projected_boxes(hull, transform(R, t), K).tolist())
 

@@ -36,14 +36,14 @@ def stray_faces(mesh: trimesh.Trimesh) -> Flags:
     points = np.einsum("nk,nkj->nj", weights, vertices[faces[face]])
     low, high = np.quantile(points, [0.5 * STRAY_FRACTION, 1.0 - 0.5 * STRAY_FRACTION], axis=0)
     size = float(np.linalg.norm(high - low))
-    if not size > 0.0 or float(np.linalg.norm(mesh.extents)) < SPREAD * size:
+    if not size > 0.0 or np.linalg.norm(mesh.extents) < SPREAD * size:
         return none
     everything = np.concatenate([points, vertices[faces].reshape(-1, 3)])
     steps = np.floor((everything - low) / (STRAY_GAP * size))
     part = _parts(np.clip(steps, -(2**18), 2**18).astype(np.int64), face, len(faces))
     shares = np.bincount(part, area) / area.sum()
     stray = (shares < STRAY_FRACTION)[part]
-    if float(area[stray].sum()) >= STRAY_FRACTION * float(area.sum()):
+    if area[stray].sum() >= STRAY_FRACTION * area.sum():
         return none
     rest = vertices[faces[~stray]].reshape(-1, 3)
     inside = (vertices >= rest.min(axis=0)) & (vertices <= rest.max(axis=0))

@@ -184,6 +184,6 @@ def _group(generators: Sequence[Tensor]) -> Tensor:
     for member in members:  # grows meanwhile
         for product in (member @ generator for generator in generators):
             traces = torch.stack(members).flatten(1) @ product.flatten()
-            if float(traces.max()) < NEARLY_EQUAL and len(members) < LARGEST_GROUP:
+            if traces.max() < NEARLY_EQUAL and len(members) < LARGEST_GROUP:
                 members.append(product)
     return torch.stack(members)

@@ -271,8 +271,10 @@ def as_numbers(values: Any, name: str, *, dtype: torch.dtype = torch.float32) ->
             plain = all(
                 isinstance(value, int | float) and not isinstance(value, bool) for value in values
             )
-            parts = [] if plain else [as_numbers(value, name, dtype=dtype) for value in values]
-            x = torch.tensor(values, dtype=dtype) if plain else torch.stack(parts)
+            if plain:
+                x = torch.tensor(values, dtype=dtype)
+            else:
+                x = torch.stack([as_numbers(value, name, dtype=dtype) for value in values])
         else:
             # as_tensor would move a tensor to the default device
             x = values if isinstance(values, Tensor) else torch.as_tensor(values)

@@ -100,7 +100,7 @@ def draw_window(
 
 def _draw_axis(picture: Bytes, ends: Tensor, T: Tensor, K: Tensor) -> None:
     """Draw an arrow between ``ends`` (2, 3) of the model; ``K`` (3, 3) has px of the picture."""
-    if float((ends @ T[2, :3] + T[2, 3]).min()) > 0.0:
+    if (ends @ T[2, :3] + T[2, 3]).min() > 0.0:
         arrow = partial(cv2.arrowedLine, line_type=cv2.LINE_AA, tipLength=0.08)
         thickness = max(2, _line_width(picture.shape[:2]))
         _draw_rimmed(arrow, picture, projected(ends, T, K), AXIS, thickness)
