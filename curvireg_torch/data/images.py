@@ -27,7 +27,7 @@ from ..geometry.cameras import camera_matrix
 from ..utils.aliases import Fields, PathName, Size
 from ..utils.arrays import Array, Bytes
 from ..utils.checks import check_integer
-from ..utils.pictures import check_pixels, damaged_picture
+from ..utils.pictures import check_pixels, decoding
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -180,13 +180,9 @@ def photo_of_picture(image: "Image") -> Photo:
         ImageError: a mode that is not read, a damaged file, or one beyond
             :mod:`curvireg_torch.errors`.
     """
-    try:
+    with decoding():
         check_pixels(image)
         return _photo(*_decoded(image, b""))
-    except ImageError:
-        raise
-    except Exception as error:  # Pillow raises errors of any kind for damaged files
-        raise damaged_picture(error) from error
 
 
 def _photo(

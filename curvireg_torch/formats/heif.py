@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import MAX_IMAGE_BYTES, ImageError, MissingDependencyError
 from ..utils.extras import install_command
-from ..utils.pictures import check_pixels, damaged_picture, open_picture
+from ..utils.pictures import check_pixels, decoding, open_picture
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -43,12 +43,8 @@ def open_photograph(data: bytes) -> "Image":
         return open_picture(data)
     if len(data) > MAX_IMAGE_BYTES:
         raise ImageError(f"larger than {MAX_IMAGE_BYTES:,} bytes; save it smaller")
-    try:
+    with decoding():
         image = _heic(data) if kind == "HEIC" else _avif(data)
-    except MissingDependencyError:
-        raise
-    except Exception as error:  # decoders raise errors of any kind for damaged files
-        raise damaged_picture(error) from error
     check_pixels(image)
     return image
 

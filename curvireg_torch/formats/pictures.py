@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ..errors import MAX_IMAGE_BYTES, CurviregError, ImageError, MissingFileError
 from ..utils.aliases import Size
 from ..utils.arrays import Array
-from ..utils.pictures import check_pixels, damaged_picture
+from ..utils.pictures import check_pixels, decoding
 from .boxes import PictureSize
 from .heif import open_photograph
 
@@ -78,15 +78,14 @@ def opened_picture(path: Path) -> Iterator[tuple["Image", int, bytes]]:
     if path.stat().st_size > MAX_IMAGE_BYTES:
         raise ImageError(f"larger than {MAX_IMAGE_BYTES:,} bytes; save it smaller", subject=path)
     try:
-        data = path.read_bytes()
-        with open_photograph(data) as image:
-            _seek_full_image(image)
-            check_pixels(image)
-            yield image, picture_metadata(image).orientation, data
+        with decoding():
+            data = path.read_bytes()
+            with open_photograph(data) as image:
+                _seek_full_image(image)
+                check_pixels(image)
+                yield image, picture_metadata(image).orientation, data
     except CurviregError as error:
         raise error.with_subject(path) from error.__cause__
-    except Exception as error:  # Pillow raises errors of any kind for damaged files
-        raise damaged_picture(error).with_subject(path) from error
 
 
 def as_in_file(pixels: Array, image: "Image", orientation: int) -> Array:

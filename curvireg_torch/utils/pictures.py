@@ -6,10 +6,12 @@ itself, and hand PostScript to Ghostscript.
 """
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from typing import TYPE_CHECKING
 
-from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, ImageError
+from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, CurviregError, ImageError
 from .files import foreign_content
 
 if TYPE_CHECKING:
@@ -72,10 +74,8 @@ def open_picture(data: bytes) -> "Image":
         _check_scans(data)
     if name == "PPM":
         data = _without_comments(data)
-    try:
+    with decoding():
         image = Image.open(BytesIO(data), formats=[name])
-    except Exception as error:  # Pillow raises errors of any kind for damaged files
-        raise damaged_picture(error) from error
     check_pixels(image)
     return image
 
@@ -84,12 +84,21 @@ def check_pixels(image: "Image") -> None:
     """Refuse a picture of too many pixels, or of TIFF's tiles, which are decoded as a whole however
     small the picture is; after each change of the page of a file with several."""
     tags = getattr(image, "tag_v2", {})
-    try:
+    with decoding():  # sides may be no numbers
         tile = int(tags.get(_TILE_WIDTH, 0)) * int(tags.get(_TILE_HEIGHT, 0))
-    except (TypeError, ValueError) as error:  # no numbers
-        raise damaged_picture(error) from error
     if max(image.width * image.height, tile) > MAX_IMAGE_PIXELS:
         raise ImageError(_TOO_MANY_PIXELS)
+
+
+@contextmanager
+def decoding() -> Iterator[None]:
+    """Within, whatever a decoder raises becomes an :class:`ImageError`; errors of ours stay."""
+    try:
+        yield
+    except CurviregError:
+        raise
+    except Exception as error:  # decoders raise errors of any kind for damaged files
+        raise damaged_picture(error) from error
 
 
 def damaged_picture(error: Exception) -> ImageError:
