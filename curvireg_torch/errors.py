@@ -10,7 +10,6 @@ in its folder or a given one.
 """
 
 from collections.abc import Sequence
-from copy import copy
 from typing import Any, Self
 
 
@@ -39,16 +38,22 @@ class _SubjectError(Exception):
         parts = (numbers, self.subject, self.message, reasons)
         return ": ".join(part for part in parts if part)
 
+    def _copy(self) -> Self:
+        # Dask changes how the standard library copies errors: copies share their attributes.
+        other = type(self)(self.message)
+        vars(other).update(vars(self))
+        return other
+
     def with_subject(self, subject: object) -> Self:
         """A copy about another subject, whatever it was about before."""
-        other = copy(self)
+        other = self._copy()
         other.subject = str(subject)
         other.images = ()
         return other
 
     def of_image(self, number: int) -> Self:
         """A copy about the same subject in a photograph, by its number from 0."""
-        other = copy(self)
+        other = self._copy()
         other.images = (number,)
         return other
 

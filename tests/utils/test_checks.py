@@ -181,6 +181,14 @@ def test_errors_keep_message_and_subject(name):
     assert str(type(error)("unusable")) == "unusable"
 
 
+def test_copies_of_errors_are_their_own_beside_dask():
+    pytest.importorskip("distributed", reason="the extra cluster")  # changes copies of errors
+    error = ImageError("unusable", subject="a.png")
+    assert str(error.with_subject("b.png")) == "b.png: unusable"
+    assert str(error.of_image(2)) == "image 2: a.png: unusable"
+    assert str(error) == "a.png: unusable"
+
+
 def test_errors_carry_the_numbers_of_photographs():
     names = ["a.png", "b.png", "c.png"]
     error = InvalidInputError("unusable", subject="mask.png", kind="camera").of_image(2)
