@@ -3,15 +3,12 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..errors import BankError
+from ..matching import ViewBank, cached_bank
+from ..pipeline import Pipeline
+from ..registration import Registrar
 from .options import RegisterOptions
-
-if TYPE_CHECKING:
-    from ..matching import ViewBank
-    from ..pipeline import Pipeline
-    from ..registration import Registrar
 
 
 def open_registrar(
@@ -19,11 +16,9 @@ def open_registrar(
     meshes: Sequence[Path],
     *,
     progress: Callable[[str, int, int], object] | None = None,
-) -> "Registrar":
+) -> Registrar:
     """The registrar of mesh files or banks; ``progress`` is called while banks are built, instead
     of showing a bar."""
-    from ..registration import Registrar
-
     pipeline = options.open_pipeline()
     banks = [_open_bank(options, mesh, pipeline, progress or options.progress) for mesh in meshes]
     banks = [bank.to(options.device) for bank in banks]
@@ -50,11 +45,9 @@ def open_registrar(
 def _open_bank(
     options: RegisterOptions,
     mesh: Path,
-    pipeline: "Pipeline",
+    pipeline: Pipeline,
     progress: bool | Callable[[str, int, int], object],
-) -> "ViewBank":
-    from ..matching import cached_bank
-
+) -> ViewBank:
     if mesh.suffix != ".safetensors":
         loaded = options.load_mesh(mesh)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
@@ -65,21 +58,16 @@ def _open_bank(
     unit = options.unit if options.unit_is_given else None
     bank = load_bank(mesh, unit=unit, up=options.up)
     if options.pose not in (None, bank.pipeline.views.pose):
-        built = (
-            "given views"
-            if bank.pipeline.views.pose == "given"
-            else f"--pose {bank.pipeline.views.pose}"
-        )
+        pose = bank.pipeline.views.pose
+        built = "given views" if pose == "given" else f"--pose {pose}"
         message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
         raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
     return bank
 
 
-def load_bank(path: Path, *, unit: str | None, up: str | None) -> "ViewBank":
+def load_bank(path: Path, *, unit: str | None, up: str | None) -> ViewBank:
     """The bank of a file; refuses a unit or an axis that is not that of its mesh, unless it is
     None."""
-    from ..matching import ViewBank
-
     bank = ViewBank.load(path)
     built_unit = bank.mesh.unit
     built_up = bank.mesh.up

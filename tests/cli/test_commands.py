@@ -125,7 +125,7 @@ def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
     """The true pose projects the mesh into the box, and the errors are those of the result."""
     options = {}
     monkeypatch.setattr(
-        "curvireg_torch.matching.cached_bank",
+        "curvireg_torch.jobs.opening.cached_bank",
         lambda _, **given: options.update(given) or truck_bank(),
     )
     monkeypatch.setattr(RegisterOptions, "open_pipeline", lambda _: truck_bank().pipeline)
