@@ -110,7 +110,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, [Path(source)], [arguments.mesh])
-    if options.camera is None and options.guess is None and options.mesh_is == "similar":
+    if options.camera is None and options.mesh_is == "similar":
         raise InvalidInputError(
             f"follow: needs the camera with --mesh-is similar; give {CAMERA_OPTIONS}"
         )
@@ -275,7 +275,7 @@ def _poses(
     from ..registration import FailedRegistration, Follower
 
     follow = None
-    prior = prior_from_limits(options.limits or {})
+    prior = prior_from_limits(options.limits)
     is_first = True
     for name, photo in frames:
         begun = time.perf_counter()
@@ -335,7 +335,7 @@ def _camera(options: "RegisterOptions", photo: "Photo") -> "Camera | None":
     camera, _ = camera_of(entry_of(options.photos[0], without_box), photo)
     if camera is None:
         return None
-    if not isinstance(options.camera, Camera):  # a guess is one for frames of this size
+    if not isinstance(options.camera, Camera):  # other cameras are those of frames of this size
         camera = camera.at((photo.image.shape[-2], photo.image.shape[-1]))
     return replace(camera, distortion=(), model="radial-tangential")
 

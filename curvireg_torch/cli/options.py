@@ -10,6 +10,7 @@ from typing import Any
 
 from ..errors import InvalidInputError
 from ..jobs.options import (
+    FIELD_OF_VIEW,
     PRIOR_OPTIONS,
     Numbers,
     RegisterOptions,
@@ -23,7 +24,7 @@ from ..utils.aliases import Fields
 FIELDS = {
     option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata
 }
-DECLARED: dict[str, Fields] = FIELDS | PRIOR_OPTIONS
+DECLARED: dict[str, Fields] = {**FIELDS, "guess": FIELD_OF_VIEW, **PRIOR_OPTIONS}
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
 MESH = ("unit", "link", "textures", "pose", "up")
 BOXES = ("box_format", "boxes")
@@ -106,18 +107,18 @@ def register_options(
     given = {
         name: value for name in FIELDS if (value := getattr(arguments, name, None)) is not None
     }
-    if given.get("camera") == "exif":
-        given["guess"] = given.pop("camera")
-    elif isinstance(given.get("camera"), str):
+    camera = given.get("camera", getattr(arguments, "guess", None))
+    if isinstance(camera, str) and camera != "exif":
         from ..data import load_camera
 
-        given["camera"] = load_camera(given["camera"])
+        camera = load_camera(camera)
+    given["camera"] = camera
     try:
         limits = limits_from_options(vars(arguments))
         prior_from_limits(limits)
     except InvalidInputError as error:
         raise InvalidInputError(f"--{error}") from error
-    check_camera(given.get("camera"), given.get("guess"))
+    check_camera(camera)
     check_device(given.get("device", "cpu"), "--device")
     options = RegisterOptions(
         photos=tuple(photos),

@@ -417,9 +417,9 @@ def _register_several(
     if arguments.list is None:
         photos = list_photographs(options, every=arguments.every)
         source = [str(path.resolve()) for path in options.photos]
-        if given := [
-            f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None
-        ]:
+        has_numbers = not isinstance(options.camera, str | float | None)
+        given = ["--box"] * (options.box is not None) + ["--camera"] * has_numbers
+        if given:
             print(f"{' and '.join(given)}: used for all {len(photos)} photographs", file=sys.stderr)
     else:
         photos = read_list(arguments.list, options)

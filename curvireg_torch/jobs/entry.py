@@ -94,18 +94,15 @@ class Entry:
 
 def entry_of(photo: Path, options: RegisterOptions) -> Entry:
     """A photograph with the box, camera, meshes and other inputs of the options."""
-    camera = options.guess if options.camera is None else options.camera
-    if isinstance(camera, list):
-        camera = tuple(camera)
     return Entry(
         name=str(photo),
         photo=photo,
         meshes=options.meshes,
         box=options.box_of(photo),
-        camera=camera,
+        camera=options.camera,
         mask=options.mask,
         instances=options.instances,
-        prior=prior_from_limits(options.limits or {}),
+        prior=prior_from_limits(options.limits),
         start=options.read_start(),
     )
 

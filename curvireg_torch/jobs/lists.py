@@ -79,10 +79,10 @@ def _entry(
             raise InvalidInputError("mesh: empty, and no MESH was given; name one")
         numbers = numbers_of(values, BOX)
         box = None if numbers is None else options.box_of(find(values["photo"]), numbers)
-        camera = given_camera(values, find, calibrations) or options.guess
+        camera = given_camera(values, find, calibrations) or options.camera
         mask = find(values["mask"]) if values.get("mask") else None
         own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
-        prior = prior_from_limits({**(options.limits or {}), **own})
+        prior = prior_from_limits({**options.limits, **own})
     except CurviregError as error:
         return Entry(shown, values["photo"], error=str(error))
     photo = find(values["photo"])
@@ -128,8 +128,8 @@ def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]
     by a folder and a pattern, counts once: no two share a name. ``every`` n-th frame of videos is
     taken. Errors are those of :func:`find_photographs`, and of :class:`.Video`.
     """
-    camera = None if isinstance(options.camera, Camera) else options.camera
-    numbers = [*(options.box or [""] * 4), *(camera or [""] * 4)]
+    camera = options.camera if isinstance(options.camera, tuple) else [""] * 4
+    numbers = [*(options.box or [""] * 4), *camera]
     cells = dict(zip((*BOX, *CAMERA), map(str, numbers), strict=True))
     entries = []
     for path in options.photos:
@@ -184,7 +184,7 @@ def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
     """Read a list of photographs: a CSV file with the columns that docs/results.md describes, in
     any order.
 
-    Empty cells mean: detect the object, and the guessed camera, meshes and limits of the options.
+    Empty cells mean: detect the object, and the camera, meshes and limits of the options.
     Blank lines, and empty cells beyond the last named column, as spreadsheets write them, do not
     count. The ``error`` of a row that cannot be used is the reason.
     """

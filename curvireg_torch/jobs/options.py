@@ -142,6 +142,13 @@ PRIOR_OPTIONS: dict[str, dict[str, Any]] = {
 }
 """What may be known about the pose: options of the command line, and columns of lists."""
 
+FIELD_OF_VIEW = {
+    "flag": "--fov",
+    "type": Numbers("DEG"),
+    "help": "horizontal field of view of the camera, if it is about known",
+}
+"""An option that is another way to give :attr:`RegisterOptions.camera`."""
+
 
 @dataclass(frozen=True)
 class RegisterOptions:
@@ -176,7 +183,8 @@ class RegisterOptions:
         "PATH:id=7 one number of a tracker",
         type=Path,
     )
-    camera: Any = _option(  # four numbers, a Camera, or None
+    # four numbers, a Camera, "exif", the horizontal field of view in degrees, or None
+    camera: Any = _option(
         None,
         "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, COLMAP, BOP or "
         "other tools, whose "
@@ -190,12 +198,6 @@ class RegisterOptions:
         "picture in which the object is white, or opaque; FILE:2 for its label 2; instead of "
         "--box or beside it",
         type=Path,
-    )
-    guess: str | float | None = _option(
-        None,
-        "horizontal field of view of the camera, if it is about known",
-        flag="--fov",
-        type=Numbers("DEG"),
     )
     start: Path | None = _option(
         None,
@@ -211,7 +213,7 @@ class RegisterOptions:
         "right, y up, z back",
         choices=START_CONVENTIONS,
     )
-    limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
+    limits: Mapping[str, Any] = field(default_factory=dict)  # on the pose, arguments of PosePrior
     unit: str | None = _option(
         None,
         "of the mesh file, and of lengths in and out (default: that which the file states, as "
@@ -381,15 +383,15 @@ def prior_from_limits(limits: Mapping[str, Any]) -> "PosePrior | None":
     return PosePrior(**limits) if limits.keys() - QUALIFIERS else None
 
 
-def check_camera(camera: "Sequence[float] | Camera | None", guess: str | float | None) -> None:
+def check_camera(camera: "tuple[float, ...] | Camera | str | float | None") -> None:
     """Refuse a camera or field of view that cannot be used, before any photograph is read."""
     from ..geometry.cameras import camera_matrix, camera_of_view
     from ..utils.checks import check_square_pixels
 
     try:
-        if isinstance(camera, Sequence):
+        if isinstance(camera, tuple):
             check_square_pixels(camera_matrix(*camera), "camera")
-        if isinstance(guess, float):
-            camera_of_view(guess, (1, 1))
+        if isinstance(camera, float):
+            camera_of_view(camera, (1, 1))
     except InvalidInputError as error:
         raise InvalidInputError(f"--{error}") from error

@@ -11,7 +11,18 @@ from ..errors import CurviregError
 from .session import STATIC
 from .side import Answers, CameraPanel, Inputs, Preview, Space
 from .stage import Stage
-from .widgets import button, file_chooser, mark, region, set_enabled, set_text, text
+from .widgets import (
+    Panel,
+    button,
+    fact_line,
+    file_chooser,
+    mark,
+    message_line,
+    region,
+    set_enabled,
+    set_text,
+    text,
+)
 from .workspace import Workspace
 
 TICK_SECONDS = 0.15  # between two looks at what changed
@@ -74,20 +85,19 @@ def build_page(workspace: Workspace) -> None:
     ui.timer(TICK_SECONDS, refresh_safely)
 
 
-class Steps:
+class Steps(Panel):
     """What is there, what is missing, and the button that finds the pose."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace = workspace
-        self.session = workspace.session
+        super().__init__(workspace)
         self.cards = dict[str, Any]()
         self.facts = dict[str, Any]()
         self.messages = dict[str, Any]()
         with region("ol", "steps"):
             with self._step(1, "photograph"):
                 self._ask_for("photograph")
-                self.facts["rig"] = text("p", "", "facts", data_testid="rig-facts")
-                self.messages["rig"] = self._message("rig")
+                self.facts["rig"] = fact_line("rig-facts")
+                self.messages["rig"] = message_line("rig")
                 with region("div", "row below"):
                     self.no_photo = button("Remove it", workspace.remove_photo, "no-photo", "quiet")
                     self.restore = button(
@@ -104,12 +114,12 @@ class Steps:
                     "use-mm",
                     "quiet below",
                 )
-                self.facts["advice"] = text("p", "", "facts", data_testid="mesh-advice")
+                self.facts["advice"] = fact_line("mesh-advice")
             with self._step(3, "box"):
                 self.no_box = button(
                     "Remove the box", lambda: self.session.shot.set_box(None), "no-box", "quiet"
                 )
-        self.messages["file"] = self._message("file")
+        self.messages["file"] = message_line("file")
         with region("div", "go"):
             self.find = button("Find the pose", self._find, "register", "primary")
             self.stop = button("Stop", workspace.stop, "stop")
@@ -118,22 +128,19 @@ class Steps:
             )
             self.stage = text("p", "", "stage", data_testid="progress", role="status")
             self.seconds = text("p", "", "stage", data_testid="seconds")
-        self.messages |= {part: self._message(part) for part in ("pose", "page")}
+        self.messages |= {part: message_line(part) for part in ("pose", "page")}
 
     @contextmanager
     def _step(self, number: int, name: str) -> Iterator[None]:
         """The card of a step, with what is known about it."""
         with region("li", "step", data_testid=f"step-{name}") as self.cards[name]:
             text("h2", name.capitalize(), data_number=str(number))
-            self.facts[name] = text("p", "", "facts", data_testid=f"{name}-facts")
+            self.facts[name] = fact_line(f"{name}-facts")
             yield
 
     def _ask_for(self, name: str) -> None:
         file_chooser("Choose files", f"upload-{name}")
-        self.messages[name] = self._message(name)
-
-    def _message(self, part: str) -> Any:
-        return text("p", "", "message", data_testid=f"message-{part}", role="alert")
+        self.messages[name] = message_line(name)
 
     def _find(self) -> None:
         self.workspace.start_search()  # the task outlives the page

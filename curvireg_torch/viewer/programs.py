@@ -106,13 +106,10 @@ def command_line(options: RegisterOptions, name: Callable[[Path], str], rig: str
         *(["--views", rig] if rig else list(map(name, options.photos)) or ["PHOTO"]),
     ]
     words += list(map(name, options.meshes)) or ["MESH"]
-    limits = options.limits or {}
-    if not limits.keys() - QUALIFIERS:
-        limits = {}
+    limits = options.limits if options.limits.keys() - QUALIFIERS else {}
     values: dict[str, Any] = {
         "box": options.box,
-        "camera": "exif" if options.guess == "exif" else options.camera,
-        "fov": None if options.guess == "exif" else options.guess,
+        "fov" if isinstance(options.camera, float) else "camera": options.camera,
         **{"near" if limit == "viewpoint" else limit: value for limit, value in limits.items()},
         **{
             key.replace("_", "-"): v

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..data import Photo, load_camera, read_photo
+from ..data import Photo, read_photo
 from ..errors import (
     MAX_VIEWER_PHOTOGRAPHS,
     CurviregError,
@@ -41,6 +41,7 @@ from .shot import Answer, Numbers, Result, Shot, numbers
 
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
 Registered = tuple[Registration, Fields, Sequence[Photograph], list[Tensor | None]]
+GivenCamera = Numbers | Camera | str | float | None  # see RegisterOptions.camera
 UNPACKED = "parts"  # the folder of what was in an archive
 
 
@@ -159,7 +160,7 @@ class Session:
         path: Path,
         box: Numbers | None,
         view: Entry | None,
-        camera: Numbers | Camera | None,
+        camera: GivenCamera,
         photo: Photo | None = None,
     ) -> Shot:
         """A photograph and a box, those of a ``view`` of a rig if there is one, without the
@@ -182,7 +183,7 @@ class Session:
         notes = (*photo.notes, *["undistorted"] * camera.distorts)
         return Shot(path, replace(photo, image=image, notes=notes), box, view)
 
-    def _open_again(self, shot: Shot, view: Entry | None, camera: Numbers | Camera | None) -> Shot:
+    def _open_again(self, shot: Shot, view: Entry | None, camera: GivenCamera) -> Shot:
         """A photograph with another camera, or row of a rig. Its box stays unless distortion is
         removed, or no longer is; its result only where no rig is concerned."""
         photo = None if shot.is_undistorted else shot.photo
@@ -279,17 +280,14 @@ class Session:
             gaps.append(f"not in the rig: {_listed(others)}; registered alone")
         return "; ".join(gaps)
 
-    def set_camera(
-        self, camera: Numbers | Camera | None = None, guess: str | float | None = None
-    ) -> None:
-        """Change the camera of all photographs that have none in a rig: four numbers, a calibrated
-        one, or a guess.
+    def set_camera(self, camera: GivenCamera = None) -> None:
+        """Change the camera of all photographs that have none in a rig.
 
         Boxes and results stay unless distortion is removed, or no longer is; after an error nothing
         has changed.
         """
         try:
-            check_camera(camera, guess)
+            check_camera(camera)
         except InvalidInputError as error:  # of the option of this name
             words = str(error).replace("--fov", "field of view")
             raise InvalidInputError(words.removeprefix("--")) from error
@@ -299,12 +297,8 @@ class Session:
             for shot in self.shots
         ]
         # at once: the page looks at them meanwhile
-        self.options = replace(self.options, camera=camera, guess=guess)
+        self.options = replace(self.options, camera=camera)
         self._replace_shots(shots)
-
-    def open_calibration(self, path: Path) -> None:
-        """Take the camera of a calibration file."""
-        self.set_camera(load_camera(path))
 
     def open_mesh(self, path: Path) -> None:
         """Check that a mesh or a bank can be used, and describe it; it replaces the one before."""
@@ -335,21 +329,19 @@ class Session:
     def set_limits(self, **limits: Any) -> None:
         """Change what is known of the pose: arguments of :class:`PosePrior`; None removes a
         limit."""
-        known = {**(self.options.limits or {}), **limits}
+        known = {**self.options.limits, **limits}
         self.options = replace(
             self.options, limits={n: value for n, value in known.items() if value is not None}
         )
 
     def remove_limits(self) -> None:
         """Forget what was known of the pose, but not which side of the mesh is its front."""
-        self.set_limits(
-            **{name: None for name in self.options.limits or {} if name not in QUALIFIERS}
-        )
+        self.set_limits(**dict.fromkeys(self.options.limits.keys() - QUALIFIERS))
 
     def object_frame(self) -> Tensor:
         """(3, 3) rotation from the mesh's axes to those of limits, see :func:`.object_frame`."""
         assert self.mesh is not None
-        return object_frame(self.mesh.up, (self.options.limits or {}).get("front"))
+        return object_frame(self.mesh.up, self.options.limits.get("front"))
 
     def hint_direction(self, position: Sequence[float]) -> None:
         """Limit the pose to views like that from a point beside the object, in the frame of limits,
@@ -382,18 +374,15 @@ class Session:
         """The registration that the inputs describe, in the photograph that is shown."""
         shot = self.shot
         camera = self.options.camera
-        guess = self.options.guess
         if shot.view is not None:  # the rig has boxes and cameras
-            camera = guess = None
+            camera = None
         if isinstance(camera, Camera):
             K = camera.matrix if shot.photo is None else camera.at(shot.size).matrix
             camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
         photos = () if shot.photo is None else tuple(each.path for each in self.together())
         meshes = () if self.mesh_path is None else (self.mesh_path,)
         box = None if shot.view is not None else shot.box
-        return replace(
-            self.options, photos=photos, meshes=meshes, box=box, camera=camera, guess=guess
-        )
+        return replace(self.options, photos=photos, meshes=meshes, box=box, camera=camera)
 
     def command(self) -> str:
         """The command line that gives the same result; none takes the box of an undistorted
@@ -425,8 +414,8 @@ class Session:
         command = self.command()
         if shot.photo is None or not request.meshes:
             raise InvalidInputError("register: choose a photograph and a mesh first")
-        check_camera(request.camera, request.guess)
-        if shot.view is not None and (request.limits or {}).keys() - QUALIFIERS:
+        check_camera(request.camera)
+        if shot.view is not None and request.limits.keys() - QUALIFIERS:
             raise InvalidInputError("a pose prior: photographs of a rig take none; press No prior")
         self.searched = tuple(shots)
         try:
@@ -531,7 +520,7 @@ def _prepared(entry: Entry, shot: Shot, camera: object) -> Photograph:
 
 def registrar_key(request: RegisterOptions) -> RegisterOptions:
     """The options of a request on which its registrar depends."""
-    return replace(request, photos=(), box=None, limits=None, camera=None, guess=None)
+    return replace(request, photos=(), box=None, limits={}, camera=None)
 
 
 def _colours_in_words(mesh: Mesh) -> str:

@@ -24,12 +24,15 @@ from ..visualization.words import (
     used_camera_in_words,
     view_in_words,
 )
-from .shot import Answer, Numbers, Result, Shot, numbers
+from .shot import Answer, Numbers, Shot, numbers
 from .widgets import (
+    Panel,
     button,
+    fact_line,
     field,
     file_chooser,
     fold,
+    message_line,
     region,
     set_enabled,
     set_pressed,
@@ -91,15 +94,12 @@ CHOICES = {
 """Options that are chosen from a list: their labels and choices."""
 
 
-class Answers:
+class Answers(Panel):
     """The chosen answer with its verdict and its downloads, and a card of each answer that can be
     chosen."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace = workspace
-        self.session = workspace.session
-        self.shown_cards: tuple[Result | None, Shot | None] = None, None
-        self.shown_answer: tuple[Answer | None, Shot | None] = None, None
+        super().__init__(workspace)
         with region(
             "section", "answers", aria_label="answer", data_testid="answers"
         ) as self.section:
@@ -145,16 +145,13 @@ class Answers:
     async def refresh(self) -> None:
         """Show the answer of the session, if it changed."""
         shot = self.session.shot
-        answer = self.session.shot.answer
+        answer = shot.answer
         self.section.set_visibility(answer is not None)
-        if self.shown_answer != (answer, shot):
-            self.shown_answer = answer, shot
-            if answer is not None:
-                self._describe()
-        if self.shown_cards != (shot.result, shot):
-            self.shown_cards = shot.result, shot
-            if shot.result is not None:
-                await self._draw_cards(shot)
+        new_shot = self.changed("shot", shot)
+        if (self.changed("answer", answer) or new_shot) and answer is not None:
+            self._describe()
+        if (self.changed("result", shot.result) or new_shot) and shot.result is not None:
+            await self._draw_cards(shot)
         for number, card in enumerate(self.cards.default_slot.children):
             set_pressed(card, answer and number == answer.number)
 
@@ -189,7 +186,7 @@ class Answers:
         if shot.view is not None:
             pose = replace(pose, rotation=shot.projection[0][:3, :3])
         mesh = result.registrar.bank.mesh
-        front = (self.session.options.limits or {}).get("front")
+        front = self.session.options.limits.get("front")
         lines = [pose_in_words(pose.rotation, up=mesh.up, front=front)]
         lines.append(
             "azimuth {:.1f}, elevation {:.1f}, theta {:.1f} degrees".format(*pose.viewpoint)
@@ -228,7 +225,7 @@ class Answers:
             self.workspace.start_search()
 
         if document.get("prior", {}).get("contradiction") is not None:
-            limits = dict(options.limits or {})
+            limits = options.limits
             front = {name: value for name, value in limits.items() if name == "front"}
             if "viewpoint" in limits:
                 azimuth, *rest = limits["viewpoint"]
@@ -271,13 +268,12 @@ class Answers:
             card.on("click", partial(shot.choose, number))
 
 
-class Inputs:
+class Inputs(Panel):
     """Input fields; what is typed or chosen goes into the session, and what changes there is
     shown."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace = workspace
-        self.session = workspace.session
+        super().__init__(workspace)
         self.selects: dict[str, Any] = {}
         with fold("Mesh and method", "options", is_open=True):
             for name, (label, choices) in CHOICES.items():
@@ -311,13 +307,12 @@ class Inputs:
                 select.value = getattr(session.options, name)
 
 
-class CameraPanel:
+class CameraPanel(Panel):
     """The camera of all photographs without a rig: two fields, each sent by Enter or on leaving it,
     and where it is from."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace = workspace
-        self.session = workspace.session
+        super().__init__(workspace)
         with region("div", "fold"):  # a card, which names the camera when its fields are folded
             with fold("Camera", "camera"):
                 text("p", CAMERA_HINT, "facts")
@@ -328,10 +323,10 @@ class CameraPanel:
                 with region("div", "row"):
                     file_chooser("From a file", "upload-camera")
                     self.exif = button(
-                        "Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet"
+                        "Guess from EXIF", lambda: self._set_camera("exif"), "exif", "quiet"
                     )
-            self.facts = text("p", "", "facts", data_testid="camera-facts")
-            self.message = text("p", "", "message", data_testid="message-camera", role="alert")
+            self.facts = fact_line("camera-facts")
+            self.message = message_line("camera")
 
     async def _set(self, count: int, typed: str) -> None:
         found = _typed_numbers(typed, count)
@@ -339,24 +334,20 @@ class CameraPanel:
             self.workspace.messages["camera"] = (
                 f"camera: expected {EXPECTED[count]}, got {typed!r:.80}"
             )
-        elif count == 4:
-            await self._set_camera(numbers(found) if found else None)
+        elif len(found) == 4:
+            await self._set_camera(numbers(found))
         else:
-            await self._set_camera(guess=found[0] if found else None)
+            await self._set_camera(found[0] if found else None)
 
-    async def _set_camera(
-        self, camera: Numbers | None = None, guess: str | float | None = None
-    ) -> None:
-        change = partial(self.session.set_camera, camera, guess)
-        await self.workspace.run("camera", change, stop=True)
+    async def _set_camera(self, camera: Numbers | str | float | None) -> None:
+        await self.workspace.run("camera", partial(self.session.set_camera, camera), stop=True)
 
     async def refresh(self) -> None:
         """Show the camera of the session, wherever it was changed."""
-        request = self.session.request()
+        camera = self.session.request().camera
         is_alone = self.session.shot.view is None
-        guess = (request.guess,) if isinstance(request.guess, float) else ()
-        show_value(self.matrix, request.camera or ())
-        show_value(self.view, guess)
+        show_value(self.matrix, camera if isinstance(camera, tuple) else ())
+        show_value(self.view, (camera,) if isinstance(camera, float) else ())
         for element in (self.matrix, self.view):
             set_enabled(element, is_alone)
         self.exif.set_visibility(self.session.has_exif and is_alone)
@@ -365,16 +356,15 @@ class CameraPanel:
 
     def _describe_camera(self) -> str:
         camera = self.session.options.camera
-        guess = self.session.options.guess
         shot = self.session.shot
         if shot.view is not None:
             words = "of each photograph, from the rig"
             return f"{words}, without its distortion" if shot.is_undistorted else words
-        if guess == "exif" and shot.photo is not None:
+        if camera == "exif" and shot.photo is not None:
             focal = shot.photo.focal_35mm
             words = f"{focal:g} mm of a 35 mm camera" if focal else "has no focal length"
             return f"from the photograph's EXIF, {words}"
-        if guess is not None:
+        if isinstance(camera, str | float):
             return "from the field of view, to about 10 %"
         if isinstance(camera, Camera):
             words = "from a calibration file"
@@ -407,14 +397,12 @@ def _typed_numbers(text: str, count: int) -> tuple[float, ...] | None:
     return found if len(found) in (0, count) and all(map(math.isfinite, found)) else None
 
 
-class Preview:
+class Preview(Panel):
     """The mesh in 3D. Turned with the mouse until it looks as in the photograph, it is a pose
     prior."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace = workspace
-        self.session = workspace.session
-        self.shown: tuple[Any, ...] = ()
+        super().__init__(workspace)
         self.scene: Any = None
         self.mark = ""
         with fold("The model", "model", is_open=True) as self.section:
@@ -429,7 +417,7 @@ class Preview:
                         f"mark-{name}",
                         "quiet",
                     )
-            self.facts = text("p", "", "facts", data_testid="prior-facts")
+            self.facts = fact_line("prior-facts")
 
     async def _hint(self) -> None:
         if self.scene is not None:
@@ -453,7 +441,7 @@ class Preview:
     async def refresh(self) -> None:
         """Show the mesh of the session, if it or its frame changed, and the pose prior."""
         mesh = self.session.mesh
-        limits = self.session.options.limits or {}
+        limits = self.session.options.limits
         self.section.set_visibility(mesh is not None)
         limiting = limits.keys() - {"front"}
         self.no_prior.set_visibility(bool(limiting))
@@ -464,9 +452,9 @@ class Preview:
         elif limiting:
             words = "There is a pose prior; the command line below has it."
         set_text(self.facts, f"Click on the side that is {self.mark}." if self.mark else words)
-        if self.shown == (mesh, limits.get("front")):
+        new_mesh = self.changed("mesh", mesh)
+        if not (self.changed("front", limits.get("front")) or new_mesh):
             return
-        self.shown = (mesh, limits.get("front"))
         self.scene = None
         self.place.clear()
         if mesh is None or len(mesh.faces) > MAX_VIEWER_FACES:
@@ -501,13 +489,12 @@ def _scene(fov: float, on_click: Callable[..., Any] | None = None) -> ui.scene:
     return scene
 
 
-class Space:
+class Space(Panel):
     """Camera, photograph and mesh in 3D, to be turned with the mouse; drawn when asked for."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace = workspace
-        self.session = workspace.session
-        self.shown: Answer | None = None
+        super().__init__(workspace)
+        self.drawn: Answer | None = None
         with fold("The answer in 3D", "space", is_open=True) as self.section:
             self.place = region("div", "preview", data_testid="space")
             self.show = button(
@@ -518,17 +505,17 @@ class Space:
         """Forget what was drawn of another answer."""
         shot = self.session.shot
         self.section.set_visibility(shot.answer is not None and shot.view is None)
-        if self.shown is not None and self.shown is not shot.answer:
-            self.shown = None
+        if self.drawn is not None and self.drawn is not shot.answer:
+            self.drawn = None
             self.place.clear()
-        self.show.set_visibility(self.shown is None)
+        self.show.set_visibility(self.drawn is None)
 
     async def _draw(self) -> None:
         shot = self.session.shot
         content = await self.workspace.run("pose", shot.glb)
         if not content:
             return
-        self.shown = shot.answer
+        self.drawn = shot.answer
         url = self.workspace.serve("space.glb", content, "model/gltf-binary")
         T, K = shot.projection
         depth = float(shot.require_result().centre(T)[2])

@@ -19,7 +19,9 @@ from ..visualization.encoding import jpeg, png, shrink, to_uint8
 from ..visualization.overlay import LEGEND
 from .shot import Numbers, Point, Shot, dragged_box
 from .widgets import (
+    Panel,
     button,
+    fact_line,
     file_chooser,
     mark,
     region,
@@ -53,14 +55,12 @@ TOUCH_HELP = {
 }
 
 
-class Stage:
+class Stage(Panel):
     """The photographs, one of which is large and can be zoomed; ``page.js`` sends what mouse,
     fingers and keys do."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace = workspace
-        self.session = workspace.session
-        self.shown: dict[str, Any] = {}  # what the page shows, to draw only what has changed
+        super().__init__(workspace)
         self.mode = "box"
         self.mask = np.zeros((1, 1), bool)
         # What a drag began with: the box or the pose, where, and whether it turns.
@@ -113,7 +113,7 @@ class Stage:
             for name, (symbol, label) in ZOOMS.items():
                 zoom = {"type": "button", "data_zoom": name, "aria_label": label}
                 text("button", symbol, "button quiet", title=label, **zoom)
-            self.hint = text("p", "", "facts", data_testid="hint")
+            self.hint = fact_line("hint")
             self.touch_hint = text("p", "", "touch", data_testid="touch-hint")
 
     def _lay_out_layers(self) -> None:
@@ -262,11 +262,6 @@ class Stage:
             self.shown["answer"] = "moved"
         self.pressed = self.moved = None
 
-    def _changed(self, name: str, value: Any) -> bool:
-        """Whether something differs from what the page shows, which it does not afterwards."""
-        before, self.shown[name] = self.shown.get(name), value
-        return before is not value
-
     async def refresh(self) -> None:
         """Show the photographs, the box and the answer of the workspace."""
         shot = self.session.shot
@@ -274,9 +269,9 @@ class Stage:
         self.area.set_visibility(shot.photo is not None)
         if shot.photo is None:
             return
-        new_photo = self._changed("photo", shot.photo)
-        new_box = self._changed("box", shot.box)
-        if self._changed("result", shot.result) or new_photo:
+        new_photo = self.changed("photo", shot.photo)
+        new_box = self.changed("box", shot.box)
+        if self.changed("result", shot.result) or new_photo:
             self._end_gesture()
             self.mode = "box" if shot.result is None else "pose"
         # changed elsewhere on the page
@@ -292,7 +287,7 @@ class Stage:
         ):
             self._commit()
         self._show_mode()
-        if self._changed("answer", shot.answer):
+        if self.changed("answer", shot.answer):
             self.pressed = self.moved = None
             await self._render_answer()
         for element in (self.solid, self.lines):
@@ -376,7 +371,7 @@ class Stage:
         if layers := await self.workspace.run("page", draw):
             self._show_layers(layers)
             self.canvas.props(f'data-object="{_extent(self.mask)}"')
-            if self._changed("zoomed", shot.result):  # page.js then shows the object
+            if self.changed("zoomed", shot.result):  # page.js then shows the object
                 self.canvas.props(f'data-answer="{time.monotonic()}"')
 
     def _show_layers(self, layers: tuple[bytes, bytes, np.ndarray]) -> None:

@@ -1,4 +1,5 @@
-"""Plain HTML elements of the page: text, buttons, choosers of files, and parts that fold away."""
+"""Plain HTML elements of the page: text, buttons, choosers of files, and parts that fold away; and
+what the parts of the page have in common."""
 
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
@@ -7,7 +8,22 @@ from typing import Any
 from nicegui import ui
 
 from ..utils.choices import IMAGES, MESHES_AND_BANKS
-from .workspace import CALIBRATIONS
+from .workspace import CALIBRATIONS, Workspace
+
+
+class Panel:
+    """A part of the page, which shows what changed in a workspace."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace = workspace
+        self.session = workspace.session
+        self.shown: dict[str, Any] = {}  # what the page shows, to draw only what has changed
+
+    def changed(self, name: str, value: Any) -> bool:
+        """Whether something differs from what the page shows, which it does not afterwards."""
+        before = self.shown.get(name)
+        self.shown[name] = value
+        return before is not value
 
 
 def region(tag: str, classes: str = "", **values: str) -> Any:
@@ -26,6 +42,16 @@ def text(tag: str, content: str = "", classes: str = "", **values: str) -> Any:
 
 def _attributes(values: Mapping[str, str]) -> str:
     return " ".join(f'{name.replace("_", "-")}="{escape(value)}"' for name, value in values.items())
+
+
+def fact_line(test_id: str) -> Any:
+    """A line, still empty, for what is known."""
+    return text("p", "", "facts", data_testid=test_id)
+
+
+def message_line(part: str) -> Any:
+    """A line, still empty, for what :attr:`.Workspace.messages` say about a part of the work."""
+    return text("p", "", "message", data_testid=f"message-{part}", role="alert")
 
 
 def set_text(element: Any, content: str) -> None:

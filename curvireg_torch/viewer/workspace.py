@@ -17,6 +17,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+from ..data import load_camera
 from ..errors import (
     MAX_ARCHIVE_FILES,
     MAX_MESH_BYTES,
@@ -45,10 +46,10 @@ SAMPLE_OPTIONS: dict[str, Any] = {
     "unit": "mm",
     "up": None,
     "pose": "upright",
-    "limits": None,
+    "limits": {},
     "mesh_is": None,
+    "camera": 30.0,  # estimated from the ellipses in the photograph
 }
-SAMPLE_OPTIONS |= {"camera": None, "guess": 30.0}  # estimated from the ellipses in the photograph
 
 _caught: ContextVar[list[Any]] = ContextVar("caught")
 
@@ -275,8 +276,9 @@ class Workspace:
             path.replace((rig if rig.is_dir() else rig.parent) / path.name)
             await self.open_rig(rig)
         elif suffix in CALIBRATIONS:
-            camera = partial(session.open_calibration, path)
-            await self.run("camera", camera, stop=True, keep=True)
+            await self.run(
+                "camera", lambda: session.set_camera(load_camera(path)), stop=True, keep=True
+            )
         elif suffix == ".zip":
             unpacked = partial(unpack, path, path.parent / UNPACKED)
             if mesh := await self.run("mesh", unpacked, keep=True):

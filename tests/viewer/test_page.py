@@ -92,29 +92,29 @@ def test_typed_numbers_go_into_the_session(workspace, build):
     def typed(matrix=None, view=None):
         asyncio.run(panel._set(1, view) if matrix is None else panel._set(4, matrix))
         refresh()
-        return session.options.camera, session.options.guess
+        return session.options.camera
 
     def shown():
         return [element.props.get("data-value") for element in (panel.matrix, panel.view)]
 
-    assert typed("300, 300, 119.5 89.123456789") == ((300, 300, 119.5, 89.123456789), None)
+    assert typed("300, 300, 119.5 89.123456789") == (300, 300, 119.5, 89.123456789)
     assert shown() == ["300 300 119.5 89.123456789", ""]
     for words in ("300 300 119.5", "3e", "300", "nan 1 2 3", "0 300 119.5 89.5"):
-        assert typed(words) == ((300, 300, 119.5, 89.123456789), None), "refused"
+        assert typed(words) == (300, 300, 119.5, 89.123456789), "refused"
         assert panel.message.content.startswith("camera"), words
         assert shown()[0] == "300 300 119.5 89.123456789"
-    assert typed("536,8 538,2 310,4 241") == ((536.8, 538.2, 310.4, 241.0), None)
+    assert typed("536,8 538,2 310,4 241") == (536.8, 538.2, 310.4, 241.0)
     assert panel.message.content == ""
-    assert typed(view="190") == ((536.8, 538.2, 310.4, 241.0), None)
+    assert typed(view="190") == (536.8, 538.2, 310.4, 241.0)
     assert "field of view" in panel.message.content
-    assert typed(view="65,5") == (None, 65.5)
+    assert typed(view="65,5") == 65.5
     assert shown() == ["", "65.5"]
-    assert typed(view="") == (None, None)
-    asyncio.run(panel._set_camera(guess="exif"))
+    assert typed(view="") is None
+    asyncio.run(panel._set_camera("exif"))
     refresh()
     assert panel.facts.content.endswith("has no focal length")
-    assert typed("") == (None, None)
-    session.options = replace(session.options, camera=(300.0, 300.0, 119.5, 0.1 + 0.2), guess=None)
+    assert typed("") is None
+    session.options = replace(session.options, camera=(300.0, 300.0, 119.5, 0.1 + 0.2))
     refresh()
     assert shown() == ["300 300 119.5 0.30000000000000004", ""], "from another window"
     asyncio.run(
@@ -211,10 +211,11 @@ def test_each_remark_has_its_repair(shown, monkeypatch):
     shot = session.shot
     answers = Answers(shown)
     monkeypatch.setattr(
-        shown, "start_search", lambda: started.append((shot.box, session.options.guess))
+        shown, "start_search", lambda: started.append((shot.box, session.options.camera))
     )
     plain = {**session.document(), "corrected_box": None}
     before = shot.box
+    camera = session.options.camera
     assert answers._repairs(plain) == {}
     hint = {
         **plain,
@@ -227,7 +228,7 @@ def test_each_remark_has_its_repair(shown, monkeypatch):
     for repair in repairs.values():
         repair()
     assert session.options.limits == {}
-    assert started == [(before, None), ((1.0, 2, 30, 40), None)]
+    assert started == [(before, camera), ((1.0, 2, 30, 40), camera)]
 
 
 def test_the_pose_is_dragged_on_the_photograph(shown):

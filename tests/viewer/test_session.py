@@ -270,7 +270,7 @@ def test_a_registrar_serves_requests_with_the_same_mesh_and_method(folder, monke
         limits={"theta": (0.0, 9.0)},
     )
     assert session.open_registrar(other, report) is first
-    assert session.open_registrar(replace(other, camera=None, guess=60.0), report) is first
+    assert session.open_registrar(replace(other, camera=60.0), report) is first
     for changes in ({"pose": "upright"}, {"meshes": (folder / "other.ply",)}):
         changed = replace(request, **changes)
         assert session.open_registrar(changed, report) == (changed.pose, changed.meshes)
@@ -346,16 +346,16 @@ def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
     with_exif(folder / "photo.png", exif(1, 50))
     session.open_photo(Path("photo.png")).set_box((10.0, 20.5, 90.0, 80.0))
     assert session.has_exif
-    session.set_camera(guess="exif")
+    session.set_camera("exif")
     assert session.command() == (
         "curvireg register photo.png MESH --box 10 20.5 90 80 --camera exif "
         "--unit mm --up=-y --pose any --box-is visible --preset fast --out result"
     )
     session.set_camera((300.0, 300.5, 119.5, 89.5))
     assert "--camera 300 300.5 119.5 89.5 --unit" in session.command()
-    session.set_camera(guess=65.0)
+    session.set_camera(65.0)
     assert "--box 10 20.5 90 80 --fov 65 --unit" in session.command()
-    session.options = replace(session.options, unit="m", guess=180.0)
+    session.options = replace(session.options, unit="m", camera=180.0)
     session.open_mesh(folder / "truck.ply")
     with refused("180"):
         session.register()
@@ -363,7 +363,7 @@ def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
     session = new_session(*words.split())
     session.set_limits(azimuth=(315.0, 45.0), elevation=(-10.0, 40.0))
     again = register_options(parse(shlex.split(session.command())[1:]))
-    assert (again.limits, again.guess) == (session.request().limits, 65)
+    assert (again.limits, again.camera) == (session.request().limits, 65)
     assert again.limits["viewpoint"] == (10.0, -20.5, 0.0)
     session.set_limits(**{**dict.fromkeys(session.options.limits), "front": "y"})
     assert "--front" not in session.command(), "it limits nothing by itself"

@@ -299,8 +299,8 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
         asyncio.run(workspace.load_sample())
         options = session.options
         assert (options.unit, options.pose) == ("mm", "upright")
-        assert options.limits is options.mesh_is is None
-        assert (options.camera, options.guess, names(workspace)) == (None, 30.0, ["coffee.jpg"])
+        assert (options.limits, options.mesh_is) == ({}, None)
+        assert (options.camera, names(workspace)) == (30.0, ["coffee.jpg"])
     assert session.shot.photo.image.shape == (3, 400, 600)
     assert "CC0" in session.shot.photo.notes[0]
     assert workspace.session.mesh_facts.endswith("mm, rendered in its colours")
@@ -310,7 +310,7 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
     send(workspace, scene / "photo.png")
     assert session.options == own
     assert (names(workspace), session.mesh_path, session.shot.box) == (["photo.png"], None, None)
-    assert session.request().guess is None
+    assert session.request().camera == camera
     send(workspace, scene / "truck.ply")
     assert workspace.session.mesh_facts.endswith(" ft, rendered in grey")
 
