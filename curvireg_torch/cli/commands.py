@@ -11,7 +11,9 @@ from typing import Any
 from ..errors import InvalidInputError, MissingFileError
 from ..evaluation.registry import DATASETS
 from ..jobs.options import whole_number
+from ..jobs.store import to_json
 from ..utils.choices import check_given
+from ..utils.executors import opened_workers
 from ..utils.files import check_writable, write_file
 from ..version import __version__
 from .libraries import load_libraries
@@ -257,7 +259,6 @@ def _run_evaluation(arguments: argparse.Namespace) -> None:
         )
     from ..evaluation.datasets import evaluate
     from ..evaluation.protocol import Protocol
-    from ..utils.executors import opened_workers
     from ..utils.threads import one_torch_thread
 
     kind = DATASETS[arguments.dataset]
@@ -415,7 +416,8 @@ def demo(arguments: argparse.Namespace) -> None:
     from ..synthetic import demo_scene
     from ..utils.threads import one_torch_thread
     from ..visualization.encoding import png, to_uint8
-    from .register import opened_registrar, print_result
+    from .printing import print_result
+    from .registering import opened_registrar
 
     options = register_options(arguments, [out / "photo.png"], [out / "mesh.ply"])
     with one_torch_thread(), output_folder(out, "demo", inputs=input_files(arguments)):
@@ -465,7 +467,6 @@ def _add_compare(commands: Any) -> None:
 def _compare_runs(arguments: argparse.Namespace) -> None:
     """Compare two evaluations."""
     from ..evaluation.compare import compare, in_words, read_run
-    from ..jobs.store import to_json
 
     first = read_run(arguments.a)
     second = read_run(arguments.b)

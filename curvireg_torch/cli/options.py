@@ -30,6 +30,7 @@ MESH = ("unit", "link", "textures", "pose", "up")
 BOXES = ("box_format", "boxes")
 PHOTOGRAPH = ("box", "box_is", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
 """Options of several commands, by the names of their fields."""
+TRACKERS = ("m3t", "visp")  # formats of a start pose that take the mesh too
 
 
 class Parser(argparse.ArgumentParser):

@@ -3,23 +3,23 @@
 import argparse
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from functools import partial
+from contextlib import ExitStack, suppress
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..errors import CurviregError, InvalidInputError, LostObjectError
+from ..errors import CurviregError, InvalidInputError
 from ..formats.exports.ros import OPTICAL_FRAME, time_stamp
-from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
-from ..utils.aliases import Document, Fields
+from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, RegisterOptions, whole_number
+from ..jobs.store import to_json
 from ..utils.choices import VIDEOS, check_given, is_one_photograph
+from ..utils.executors import opened_workers
 from .libraries import load_libraries
 from .options import (
     BOXES,
     PHOTOGRAPH,
+    TRACKERS,
     add_command,
     add_limits,
     add_options,
@@ -31,13 +31,6 @@ from .options import (
     numbers_among,
     register_options,
 )
-from .stages import shown_stages
-
-if TYPE_CHECKING:
-    from ..jobs.lists import Counts
-    from ..jobs.options import RegisterOptions
-    from ..registration import Registrar
-    from ..utils.executors import Workers
 
 # photographs of a list that could not be registered, of which the command prints the reason
 MAX_FAILURES = 10
@@ -46,10 +39,7 @@ ENOUGH = {"pose": ("reliable",), "axis": ("reliable", "reliable axis")}
 # exit codes of ``--strict``
 NONE_RELIABLE = 3
 SOME_FAILED = 4
-NOT_CALIBRATED = "not calibrated for other terms, fields or views than the default ones"
-TRACKERS = ("m3t", "visp")
 FORMATS = ("ros", *TRACKERS)
-OPEN_AXES = 1.0  # axes of rotation that a fit leaves undetermined, from which the advice says so
 
 
 def add_register(commands: Any) -> None:
@@ -238,15 +228,14 @@ def run(arguments: argparse.Namespace) -> int:
         is_enough = not arguments.strict or verdict in ENOUGH[arguments.need or "pose"]
         return 0 if is_enough else NONE_RELIABLE
     options = _checked_options(arguments)
-    from ..utils.executors import opened_workers
     from ..utils.threads import one_torch_thread
+    from .registering import register_several
 
-    with (
-        one_torch_thread(),
-        _output(arguments) as out,
-        opened_workers(arguments.jobs, arguments.scheduler) as workers,
-    ):
-        counts = _register_several(options, arguments, out, workers)
+    with ExitStack() as stack:
+        stack.enter_context(one_torch_thread())
+        out = arguments.out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        workers = stack.enter_context(opened_workers(arguments.jobs, arguments.scheduler))
+        counts = register_several(options, arguments, out, workers)
         if arguments.json:
             print((out / "results.jsonl").read_text(encoding="utf-8"), end="")
     notes = sys.stderr if arguments.json else sys.stdout
@@ -266,7 +255,7 @@ def run(arguments: argparse.Namespace) -> int:
     return SOME_FAILED if counts.failures else 0
 
 
-def _checked_options(arguments: argparse.Namespace) -> "RegisterOptions":
+def _checked_options(arguments: argparse.Namespace) -> RegisterOptions:
     """The options; errors in them come before any photograph is read."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
     if arguments.list is not None and arguments.progress:  # a long one takes seconds
@@ -286,27 +275,17 @@ def _register_alone(arguments: argparse.Namespace) -> str:
             stack.enter_context(output_folder(arguments.out, "register", inputs=inputs))
         options = _checked_options(arguments)
         from ..utils.threads import one_torch_thread
+        from .printing import print_result
+        from .registering import register_one, register_views
 
         stack.enter_context(one_torch_thread())
-        register = _register_one if arguments.views is None else _register_rig
+        register = register_one if arguments.views is None else register_views
         document = register(options, arguments)
         if arguments.json:
-            from ..jobs.store import to_json
-
             print(to_json(document), end="")
         else:
             print_result(document, arguments.out)
     return str(document["verdict"])
-
-
-@contextmanager
-def _output(arguments: argparse.Namespace) -> Iterator[Path]:
-    """The folder of the results, or one for the time being."""
-    if arguments.out is not None:
-        yield arguments.out
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        yield Path(folder)
 
 
 def _photographs_of_rig(arguments: argparse.Namespace) -> Iterator[Path]:
@@ -317,309 +296,3 @@ def _photographs_of_rig(arguments: argparse.Namespace) -> Iterator[Path]:
 
     with suppress(CurviregError):  # that the registration reports
         yield from (view.photo for view in read_rig(arguments.views, arguments.meshes[0]))
-
-
-def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> Document:
-    """Register one photograph and write the result; returns its document."""
-    from ..jobs.entry import entry_of, prepare
-    from ..jobs.photograph import register_entry
-    from ..jobs.result_files import write_lost
-    from ..visualization.words import camera_in_words
-
-    out = arguments.out
-    path = options.photos[0]
-    entry = entry_of(path, options)
-    photograph = prepare(entry)
-    if options.progress and not (options.box or options.boxes or options.mask or options.start):
-        print(
-            f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable",
-            file=sys.stderr,
-        )
-    with opened_registrar(options) as (registrar, seconds):
-        try:
-            found = register_entry(entry, photograph, registrar, bank_seconds=seconds)
-        except LostObjectError as error:
-            if out is not None:
-                write_lost(out, str(error))
-            raise
-    if out is not None:
-        found.write(out)
-    _write_pose(arguments, found.document, found.registrar.of_mesh(found.mesh_index))
-    for warning in found.warnings:
-        print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
-    remarks = [*photograph.facts["picture"]["notes"], *camera_in_words(found.document)]
-    if photograph.camera is not None and photograph.camera.distorts:
-        remarks.append(
-            "distortion of the lens removed: boxes and overlay.png are of the undistorted "
-            "photograph"
-        )
-    if not found.reliable and options.pose == "upright" and options.up is None:
-        axis = found.registrar.of_mesh(found.mesh_index).bank.mesh.up
-        remarks.append(f"--pose upright: {axis} of the mesh is taken as up; --up names another")
-    if remarks:  # with --json, standard output holds only the result
-        print(f"{path}: {'; '.join(remarks)}", file=sys.stderr if arguments.json else sys.stdout)
-    return found.document
-
-
-def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> Document:
-    """Register the photographs of a rig together and write the result; returns its document."""
-    from ..jobs.photograph import prepare_views
-    from ..jobs.result_files import write_views
-    from ..jobs.rigs import read_rig, register_rig
-    from ..visualization.words import view_in_words
-
-    out = arguments.out
-    rig = read_rig(arguments.views, options.meshes[0])
-    photographs = prepare_views(rig)
-    with opened_registrar(options) as (registrar, seconds):
-        result, document = register_rig(
-            arguments.views, rig, photographs, registrar, bank_seconds=seconds
-        )
-    document["mesh"] = str(options.meshes[result.mesh_index])
-    if out is not None:
-        write_views(out, document, registrar, result, photographs)
-    _write_pose(arguments, document, registrar.of_mesh(result.mesh_index))
-    if not arguments.json:
-        print("pose in the world (model to world)")
-        for view in document["photographs"]:
-            print(f"{view['name']}: {view_in_words(view)}")
-    return document
-
-
-def _write_pose(arguments: argparse.Namespace, document: Fields, registrar: "Registrar") -> None:
-    """Write the pose in the format of another tool, if one is asked for."""
-    from ..formats.exports.ros import write_ros
-
-    if arguments.format in TRACKERS:
-        from ..jobs.trackers import write_start
-
-        write_start(arguments.format, arguments.out, registrar.bank.mesh, document)
-    elif arguments.format:
-        mesh = Path(document.get("mesh") or arguments.meshes[0])
-        chosen = {name: getattr(arguments, name) for name in ("stamp", "frame")}
-        given = {name: value for name, value in chosen.items() if value is not None}
-        write_ros(arguments.out, document, child=mesh.stem, **given)
-        if document["covariance"] is None:
-            print(
-                "curvireg: no pose_with_covariance.yaml, as this pose has no covariance",
-                file=sys.stderr,
-            )
-
-
-def _register_several(
-    options: "RegisterOptions", arguments: argparse.Namespace, out: Path, workers: "Workers"
-) -> "Counts":
-    """Register photographs that are named one by one, or by a list."""
-    from ..jobs.lists import list_photographs, read_list, register_list
-    from ..jobs.opening import open_registrar
-    from ..pipeline import field_digest
-
-    if arguments.list is None:
-        photos = list_photographs(options, every=arguments.every)
-        source = [str(path.resolve()) for path in options.photos]
-        has_numbers = not isinstance(options.camera, str | float | None)
-        given = ["--box"] * (options.box is not None) + ["--camera"] * has_numbers
-        if given:
-            print(f"{' and '.join(given)}: used for all {len(photos)} photographs", file=sys.stderr)
-    else:
-        photos = read_list(arguments.list, options)
-        source = [str(arguments.list.resolve())]
-    names = (
-        "bank_decides",
-        "pose",
-        "box_is",
-        "mesh_is",
-        "unit",
-        "link",
-        "up",
-        "hypotheses",
-        "refine",
-        "renderer",
-        "device",
-    )
-    settings = {
-        "pipeline": options.open_pipeline().describe(),
-        "field": None if options.network is None else field_digest(options.network),
-        **{name: getattr(options, name) for name in names},
-    }
-    return register_list(
-        photos,
-        out,
-        partial(open_registrar, options),
-        inputs=input_files(arguments),
-        source=source,
-        settings=settings,
-        textures=[] if options.textures is None else [options.textures],
-        progress=options.progress,
-        workers=workers,
-    )
-
-
-def print_result(document: Document, out: Path) -> None:
-    """Print a :func:`~curvireg_torch.jobs.documents.result_document`; ``out`` is the folder
-    of its files."""
-    from ..registration.confidence import two_decimals
-    from ..visualization.words import measured, remarks
-
-    confidence = NOT_CALIBRATED
-    if document["confidence"] is not None:
-        confidence = two_decimals(document["confidence"])
-    kind = " (as seen by a camera that looks straight at it)"
-    of_camera = "" if document["translation"] is not None else kind
-    print(
-        f"viewpoint: {_angles(document)}{of_camera}   score {document['score']:.3f}   confidence "
-        f"{confidence}, {document['verdict']}"
-    )
-    if not document["reliable"]:
-        print(f"take the pose as a guess; {_advice(document)}")
-    _print_rivals(document)
-    if ", " in document.get("inputs", {}).get("mesh", ""):
-        print(f"mesh: {document['mesh']}")
-    for line in remarks(document):
-        print(line)
-    _print_objects(document)
-    if document["translation"] is not None:
-        deviation = (document.get("camera") or {}).get("focal_deviation", 0.0)
-        numbers = ", ".join(measured(document["translation"], deviation))
-        print(f"translation: {numbers} {document['unit']}")
-    if (deviations := document["standard_deviations"]) is not None:
-        rotation, translation = (
-            ", ".join("unknown" if v is None else f"{v:.2g}" for v in deviations[name])
-            for name in ("rotation_deg", "translation")
-        )
-        values = f"{rotation} degrees; {translation} {document['unit']}"
-        print(f"standard deviations: {values}   (about and along the camera's axes)")
-    seconds = document["seconds"]
-    print(
-        f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see "
-        f"{out}/overlay.png"
-    )
-
-
-def _print_objects(document: Document) -> None:
-    """Print where objects were detected, and the confidence of each if there are several."""
-    from ..registration.confidence import two_decimals
-    from ..visualization.words import corners
-
-    instances = document.get("detection", {}).get("instances", [])
-    several = len(instances) > 1
-    if several:
-        print(f"{len(instances)} objects, the best first:")
-    for instance in instances:
-        sure = ""
-        if several and instance["confidence"] is not None:
-            sure = f"confidence {two_decimals(instance['confidence'])}, {instance['verdict']}; "
-        print(
-            f"{'' if several else 'found '}in box {corners(instance['box'])}: there with "
-            f"probability {two_decimals(instance['score'])}; {sure}{_angles(instance)}"
-            f"{_place(instance, document)}"
-        )
-
-
-def _place(pose: Document, document: Document) -> str:
-    """The translation of an instance, behind its angles; "" without a camera."""
-    if pose["translation"] is None:
-        return ""
-    return f", at {', '.join(f'{v:.4g}' for v in pose['translation'])} {document['unit']}"
-
-
-def _angles(pose: Document) -> str:
-    return (
-        ", ".join(f"{name} {value:.1f}" for name, value in pose["viewpoint"].items()) + " degrees"
-    )
-
-
-def _print_rivals(document: Document) -> None:
-    """Print rivals that are nearly as probable as the best pose, if there are any."""
-    from ..registration.confidence import two_decimals
-    from ..registration.result import likely_rivals
-
-    if document["ambiguous"] is None:
-        return
-    if document["ambiguous"].startswith("mesh"):
-        every = enumerate(document["mesh_probabilities"])
-        of_meshes = ", ".join(f"mesh {k}: {two_decimals(p)}" for k, p in every)
-        print(f"several meshes fit: {of_meshes}; a photograph of where they differ decides")
-        return
-    probabilities = document["probabilities"]
-    pair = document["pair_probability"]
-    likely = likely_rivals(probabilities, pair, is_hidden=document["feature_is_hidden"])
-    if not likely:
-        print("right up to turns that only a small feature tells apart, which is not in view")
-        return
-    for k in likely:
-        rival = _angles(document["hypotheses"][k])
-        print(f"could also be: {rival}   probability {two_decimals(probabilities[k])}")
-    words = {
-        "half turn": "are flipped by 180 degrees",
-        "mirror": "are mirror images",
-        "several": "differ",
-    }
-    none = f"none of them: {two_decimals(document['no_match_probability'])}"
-    decides = "a pose prior decides: --side, --azimuth or --near"
-    print(f"the poses {words[document['ambiguous']]}; {none}; {decides}")
-
-
-def _advice(document: Document) -> str:
-    """What to try after a registration that is not reliable, by the reason that was measured, if
-    there is one."""
-    mesh = "that the mesh is the object's, in its --unit and with its --up axis"
-    features = document["confidence_features"]
-    if document["warnings"]:
-        return "correct what the warning names"
-    if document["ambiguous"] is not None:
-        return "more than one pose fits"
-    if document.get("confidence", 0.0) is None:
-        return "look at the overlay, or leave --preset and other settings out to have a confidence"
-    if "distance" in document.get("prior", {}):
-        return f"check --distance, --camera, and {mesh}"
-    if "detection" in document:
-        return f"add --box, and check {mesh}"
-    if (features.get("border") or 0) > 0:
-        return "the box ends at the border of the photograph: take one that shows the whole object"
-    if document["translation"] is None:
-        return f"give the --camera, and check {mesh}"
-    if suspicion := _suspicious_box(document.get("inputs", {})):
-        return f"{suspicion}; and check {mesh}"
-    if (features.get("undetermined") or 0.0) >= OPEN_AXES:
-        return (
-            "the contours that were found leave its rotation open: take a sharper or closer one, "
-            f"and check {mesh}"
-        )
-    if document["verdict"] == "unsure":
-        return (
-            "look whether its contours fit in the overlay; a tight box, the --camera, --pose "
-            "upright or a pose prior make it surer"
-        )
-    return f"check that the box is tight, and {mesh}"
-
-
-def _suspicious_box(inputs: Document) -> str:
-    """What a box of an answer that is not reliable may be instead of px of the photograph as it is
-    shown; "" without a suspicion."""
-    box = inputs.get("box")
-    picture = inputs.get("picture")
-    if box is None or picture is None:
-        return ""
-    if max(box) <= 100.0 < min(picture["width"], picture["height"]):
-        return "the box is in px: of percent, divide it by 100 and add --box-format fractions"
-    if (orientation := picture["orientation"]) != 1:
-        return (
-            f"box and mask are of the photograph as it is shown, with its EXIF orientation "
-            f"{orientation} applied: check that they are not of the pixels in the file"
-        )
-    return ""
-
-
-@contextmanager
-def opened_registrar(options: "RegisterOptions") -> "Iterator[tuple[Registrar, float]]":
-    """The registrar of the options' meshes, and the seconds that it took to open. A terminal shows
-    its stages."""
-    from ..jobs.opening import open_registrar
-
-    start = time.perf_counter()
-    with shown_stages(shown=options.progress) as show:
-        progress = show if options.progress else None
-        registrar = open_registrar(options, options.meshes, progress=progress)
-        registrar.progress = progress or False
-        yield registrar, time.perf_counter() - start

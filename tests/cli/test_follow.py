@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from curvireg_torch import data
-from curvireg_torch.cli import main
-from curvireg_torch.cli.follow import Tally
+from curvireg_torch.cli import following, main
+from curvireg_torch.cli.following import Tally
 from curvireg_torch.data import Video
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Follower
@@ -192,7 +192,7 @@ def test_follow_guesses_the_camera_from_the_first_frame(
     frames, follow, tmp_path, words, monkeypatch
 ):
     read = Mock(wraps=data.read_photo)
-    monkeypatch.setattr(data, "read_photo", read)
+    monkeypatch.setattr(following, "read_photo", read)
     assert follow(*words.split(), "--out", tmp_path) == 0
     assert [call.args[0].name for call in read.call_args_list] == [f"{k}.png" for k in range(4)]
     check_poses(tmp_path, frames)

@@ -11,7 +11,8 @@ import torch
 
 from curvireg_torch import Registrar, camera_matrix
 from curvireg_torch.cli import main, parse
-from curvireg_torch.cli.register import _advice, _print_rivals, _write_pose, print_result
+from curvireg_torch.cli.printing import _advice, _print_rivals, print_result
+from curvireg_torch.cli.registering import _write_pose
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
@@ -93,7 +94,7 @@ def test_an_upright_mesh_that_is_not_recognised_is_told_which_axis_was_taken_as_
 
 def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, refused, monkeypatch):
     monkeypatch.setattr(
-        "curvireg_torch.jobs.opening.open_registrar", lambda *_: pytest.fail("opened")
+        "curvireg_torch.cli.registering.open_registrar", lambda *_: pytest.fail("opened")
     )
     refused(register_one(box=["900", "5", "950", "90"]), "0.png: box", "entirely outside")
     refused(register_one("--camera", "exif"), "0.png", "no focal length")
