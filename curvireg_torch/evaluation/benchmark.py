@@ -15,7 +15,7 @@ from ..errors import InvalidInputError
 from ..geometry import Camera, viewpoint_from_rotation
 from ..geometry.pose_prior import object_frame
 from ..jobs.entry import Entry
-from ..jobs.store import Row
+from ..jobs.store import Row, Rows
 from ..mesh.mesh import format_up
 from ..utils.files import write_csv
 from . import metrics
@@ -82,7 +82,7 @@ class Benchmark(ABC):
         count = n if limit is None else min(limit, n)
         return [i * n // count for i in range(count)]
 
-    def copies(self, samples: Sequence[Row]) -> list[list[Row]]:
+    def copies(self, samples: Rows) -> list[list[Row]]:
         """For each of some samples, all samples of the same object or class in its photograph,
         itself first."""
         groups = defaultdict[Any, list[Row]](list)
@@ -134,7 +134,7 @@ class Benchmark(ABC):
             error=error,
         )
 
-    def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
+    def errors(self, samples: Rows, rows: Rows) -> dict[str, Tensor]:
         """Errors (N,) by name, float64: ``inf`` for a miss, NaN where the truth is unknown."""
         R = estimated_rotations(rows)
         truth = true_rotations(samples)
@@ -144,14 +144,14 @@ class Benchmark(ABC):
         return {"error_deg": errors}
 
     @abstractmethod
-    def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
+    def scores(self, rows: Rows, errors: Errors, chosen: list[int]) -> Row:
         """Scores of the chosen results."""
 
-    def subsets(self, samples: Sequence[Row]) -> dict[str, list[bool]]:
+    def subsets(self, samples: Rows) -> dict[str, list[bool]]:
         """Which objects belong to each subset that is scored by itself."""
         return {}
 
-    def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
+    def summary(self, samples: Rows, rows: Rows, errors: Errors) -> Row:
         """Scores of the results ``rows``, none of them skipped: of all, of subsets, and of each
         group."""
         everything = list(range(len(rows)))
@@ -166,7 +166,7 @@ class Benchmark(ABC):
         }
 
     def scores_of_groups(
-        self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors, chosen: Sequence[int]
+        self, samples: Rows, rows: Rows, errors: Errors, chosen: Sequence[int]
     ) -> Row:
         """Scores of each group of the chosen results."""
         groups = defaultdict[Any, list[int]](list)
@@ -182,9 +182,7 @@ class Benchmark(ABC):
         }
         return {"n": len(errors), **accuracies, "med_err_deg": metrics.median_error(errors)}
 
-    def write_predictions(
-        self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors
-    ) -> None:
+    def write_predictions(self, path: Path, samples: Rows, rows: Rows, errors: Errors) -> None:
         """Write one line for each object: its annotation, the estimate, errors, the true angles,
         ``true_azimuth``..."""
         names = ("azimuth", "elevation", "theta")
@@ -207,9 +205,7 @@ class Benchmark(ABC):
             lines.append([_cell(line.get(name, "")) for name in self.columns])
         write_csv(path, lines)
 
-    def write_errors(
-        self, path: Path, keys: Sequence[str], samples: Sequence[Row], errors: Errors
-    ) -> None:
+    def write_errors(self, path: Path, keys: Sequence[str], samples: Rows, errors: Errors) -> None:
         """Write one line for each object with all digits of its errors: ``inf`` for a miss, empty
         where the truth is unknown."""
         lines: list[Sequence[object]] = [("key", "group", *errors)]
@@ -233,7 +229,7 @@ def _cell(value: object) -> object:
     return value
 
 
-def estimated_rotations(rows: Sequence[Row]) -> Tensor:
+def estimated_rotations(rows: Rows) -> Tensor:
     """(N, 3, 3) float64; NaN for rows without an estimate."""
     missing = [[math.nan] * 3] * 3
     return torch.tensor([row.get("rotation", missing) for row in rows], dtype=torch.float64).view(
@@ -241,6 +237,6 @@ def estimated_rotations(rows: Sequence[Row]) -> Tensor:
     )
 
 
-def true_rotations(samples: Sequence[Row]) -> Tensor:
+def true_rotations(samples: Rows) -> Tensor:
     """(N, 3, 3) float64; NaN where the pose is unknown."""
     return torch.cat([NO_SYMMETRIES, *(sample["rotation"].double()[None] for sample in samples)])

@@ -18,7 +18,7 @@ from ..errors import CurviregWarning
 from ..geometry import symmetry_transforms
 from ..geometry.cameras import transform
 from ..jobs.entry import Entry
-from ..jobs.store import Row
+from ..jobs.store import Row, Rows
 from ..mesh import load_mesh
 from ..utils.files import write_csv
 from . import metrics
@@ -98,7 +98,7 @@ class BOPBenchmark(Benchmark):
         T = T_two @ torch.linalg.inv(T_one)
         return replace(entry, box=box, prior=None, T_cam_from_world=T)
 
-    def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
+    def errors(self, samples: Rows, rows: Rows) -> dict[str, Tensor]:
         """Rotation errors in degrees, ADD(-S) and MSSD in diameters, MSPD in image widths."""
         names = ("rotation", "add", "mssd", "mspd")
         errors = torch.full((len(names), len(rows)), torch.inf, dtype=torch.float64)
@@ -112,7 +112,7 @@ class BOPBenchmark(Benchmark):
             )
         return dict(zip(names, errors, strict=True))
 
-    def _errors_of_one_object(self, samples: Sequence[Row], rows: Sequence[Row]) -> Tensor:
+    def _errors_of_one_object(self, samples: Rows, rows: Rows) -> Tensor:
         path, info = self._scored_model(samples[0])
         points = torch.from_numpy(load_mesh(path, unit=self.unit).vertices.copy())
         symmetries = symmetry_transforms(info)
@@ -145,7 +145,7 @@ class BOPBenchmark(Benchmark):
             return Path(sample["model_path"]), info
         return self._scored_files[number], self._scored_infos.get(number, info)
 
-    def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
+    def scores(self, rows: Rows, errors: Errors, chosen: list[int]) -> Row:
         """Rotation errors up to the symmetries, ADD(-S) recall, average recall of MSSD and MSPD,
         and ``ar_rgb``, the mean of these two."""
         recalls = {}
@@ -155,7 +155,7 @@ class BOPBenchmark(Benchmark):
         both = (recalls["mssd_ar"] + recalls["mspd_ar"]) / 2.0
         return {**self.rotation_scores(errors["rotation"][chosen]), **recalls, "ar_rgb": both}
 
-    def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
+    def summary(self, samples: Rows, rows: Rows, errors: Errors) -> Row:
         folders = {s["obj_id"]: self._scored_model(s)[0].parent.name for s in samples}
         models = {
             name: sorted(key for key, folder in folders.items() if folder == name)
@@ -169,12 +169,10 @@ class BOPBenchmark(Benchmark):
         dataset = re.sub("[_-]", "", self.dataset.root.resolve().name)
         return f"{method}_{dataset}-{self.dataset.split.replace('_', '-')}.csv"
 
-    def subsets(self, samples: Sequence[Row]) -> dict[str, list[bool]]:
+    def subsets(self, samples: Rows) -> dict[str, list[bool]]:
         return {"unoccluded": [s["visib_fract"] >= UNOCCLUDED for s in samples]}
 
-    def write_predictions(
-        self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors
-    ) -> None:
+    def write_predictions(self, path: Path, samples: Rows, rows: Rows, errors: Errors) -> None:
         """The results file of the BOP challenge, with all digits; it omits objects without an
         estimate."""
         images = [(s["scene_id"], s["image_id"]) for s in samples]
@@ -192,7 +190,7 @@ class BOPBenchmark(Benchmark):
         write_csv(path, lines)
 
 
-def same_instances(samples: Sequence[Row]) -> list[list[int]]:
+def same_instances(samples: Rows) -> list[list[int]]:
     """Groups of the samples of a BOP set that show the same instance of an object in photographs of
     one scene.
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..jobs.outputs import output_folder
 from ..jobs.runner import results_digest, run_entries, thumbnail_of
-from ..jobs.store import ResultStore, Row, has_pose, to_json
+from ..jobs.store import ResultStore, Row, Rows, has_pose, to_json
 from ..matching import cached_bank
 from ..mesh import load_mesh
 from ..pipeline import DEFAULT, PRESETS, Pipeline
@@ -181,7 +181,7 @@ def report(
 
 
 def _write_page(
-    benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Sequence[Row], errors: Tensor
+    benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Rows, errors: Tensor
 ) -> None:
     """The best and the worst objects: by error; then those of unknown pose, by confidence; then
     those that failed."""

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from ..geometry.crops import box_iou
-from ..jobs.store import Row
+from ..jobs.store import Row, Rows
 
 MIN_IOU = 0.5  # intersection over union from which a box is right
 
 
-def copy_shown(copies: Sequence[Row], row: Row) -> Row:
+def copy_shown(copies: Rows, row: Row) -> Row:
     """Of the ``copies`` of an object in a photograph, that which the box of a result overlaps most;
     the first one if it overlaps none. Where no box is given, each of them is a right answer."""
     if "rotation" not in row:
@@ -24,7 +24,7 @@ def copy_shown(copies: Sequence[Row], row: Row) -> Row:
     return copies[int(overlap.argmax())]
 
 
-def detection_recall(copies: Sequence[Sequence[Row]], rows: Sequence[Row]) -> Row:
+def detection_recall(copies: Sequence[Rows], rows: Rows) -> Row:
     """``recall_1``, ``recall_5``, ``recall_20``: fractions of ``n`` objects one of whose annotated
     ``copies`` is among the best proposals.
 

@@ -1,6 +1,6 @@
 """PASCAL3D+: viewpoints, also up to the symmetries of its classes."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import ClassVar
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..data import Pascal3DPlus
-from ..jobs.store import Row
+from ..jobs.store import Row, Rows
 from .benchmark import Benchmark, Errors, estimated_rotations, true_rotations
 from .metrics import symmetric_rotation_error
 from .protocol import random_numbers
@@ -97,7 +97,7 @@ class Pascal3DBenchmark(Benchmark):
             "pixel_origin": self.dataset.pixel_origin,
         }
 
-    def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
+    def errors(self, samples: Rows, rows: Rows) -> dict[str, Tensor]:
         R = estimated_rotations(rows)
         truth = true_rotations(samples)
         plain = symmetric = super().errors(samples, rows)["error_deg"]
@@ -106,17 +106,17 @@ class Pascal3DBenchmark(Benchmark):
             symmetric = torch.where(mask & plain.isfinite(), error(R, truth), symmetric)
         return {"error_deg": plain, "symmetric_error_deg": symmetric}
 
-    def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
+    def scores(self, rows: Rows, errors: Errors, chosen: list[int]) -> Row:
         """Acc(pi/6), Acc(pi/18) and MedErr, also up to the symmetries of the classes."""
         plain, aware = (self.rotation_scores(each[chosen]) for each in errors.values())
         del aware["n"]
         return {**plain, "symmetry_aware": aware}
 
-    def subsets(self, samples: Sequence[Row]) -> dict[str, list[bool]]:
+    def subsets(self, samples: Rows) -> dict[str, list[bool]]:
         easy = [not any(s[flag] for flag in self.flags) for s in samples]
         return {"easy": easy, **{flag: [s[flag] for s in samples] for flag in self.flags}}
 
-    def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
+    def summary(self, samples: Rows, rows: Rows, errors: Errors) -> Row:
         """Scores as :meth:`Benchmark.summary`, also as plain means over the classes, and those of
         easy objects by class, as some tables have them."""
         summary = super().summary(samples, rows, errors)

@@ -1,9 +1,7 @@
 """Folders of the user: viewpoints, where they are known."""
 
-from collections.abc import Sequence
-
 from ..data import PoseFolder
-from ..jobs.store import Row
+from ..jobs.store import Row, Rows
 from .benchmark import Benchmark, Errors
 
 
@@ -33,7 +31,7 @@ class PoseFolderBenchmark(Benchmark):
     )
     dataset: PoseFolder
 
-    def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
+    def scores(self, rows: Rows, errors: Errors, chosen: list[int]) -> Row:
         """Accuracy at 15 and 30 degrees and the median error where the pose is known; confidence of
         all."""
         posed = errors["error_deg"][chosen]

@@ -3,12 +3,12 @@
 import platform
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from typing import Any
 
 import torch
 
 from ..registration.result import Detection, Registration
 from ..registration.target import Target
+from ..utils.aliases import Document, Fields
 from ..version import __version__
 
 # Version of the keys of result.json; raised when a key is removed or changes its meaning
@@ -32,9 +32,7 @@ CONVENTIONS = {  # docs/results.md describes all keys
 }
 
 
-def result_document(
-    result: Registration, target: Target, seconds: Mapping[str, float]
-) -> dict[str, Any]:
+def result_document(result: Registration, target: Target, seconds: Mapping[str, float]) -> Fields:
     """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank``
     and ``register``."""
     target = target.of_mesh(result.mesh_index)
@@ -59,7 +57,7 @@ def result_document(
     }
 
 
-def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
+def detection_document(results: Sequence[Registration]) -> Fields:
     """The key ``detection``: the objects that :func:`.detect` found in one photograph."""
     found = [(result, result.detection) for result in results if result.detection is not None]
     instances = [
@@ -78,7 +76,7 @@ def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
     return {**places_document(found[0][1]), "instances": instances}
 
 
-def places_document(detection: Detection) -> dict[str, Any]:
+def places_document(detection: Detection) -> Fields:
     """Where the object may be: the first place's score, and all proposals."""
     pairs = zip(detection.boxes, detection.responses, strict=True)
     return {
@@ -87,6 +85,6 @@ def places_document(detection: Detection) -> dict[str, Any]:
     }
 
 
-def line_document(document: Mapping[str, Any]) -> dict[str, Any]:
+def line_document(document: Document) -> Fields:
     """The content of ``result.json`` under the keys of a line of ``results.jsonl``."""
     return {LINE_KEYS.get(key, key): value for key, value in document.items()}

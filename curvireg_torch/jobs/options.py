@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import CurviregError, InvalidInputError
+from ..utils.aliases import Document, Fields
 from ..utils.choices import (
     BOX_FORMATS,
     BOX_KINDS,
@@ -124,7 +125,7 @@ def _option(default: Any, text: str, **how: Any) -> Any:
     return field(default=default, metadata={"help": text, **how})
 
 
-PRIOR_OPTIONS: dict[str, dict[str, Any]] = {
+PRIOR_OPTIONS: dict[str, Fields] = {
     "azimuth": {"type": Numbers("LOW HIGH"), "help": "counted upwards; 300 60 goes through 0"},
     "elevation": {"type": Numbers("LOW HIGH"), "help": "-90 below to 90 above the object"},
     "theta": {"type": Numbers("LOW HIGH"), "help": "in-plane rotation"},
@@ -213,7 +214,7 @@ class RegisterOptions:
         "right, y up, z back",
         choices=START_CONVENTIONS,
     )
-    limits: Mapping[str, Any] = field(default_factory=dict)  # on the pose, arguments of PosePrior
+    limits: Document = field(default_factory=dict)  # on the pose, arguments of PosePrior
     unit: str | None = _option(
         None,
         "of the mesh file, and of lengths in and out (default: that which the file states, as "
@@ -346,7 +347,7 @@ class RegisterOptions:
         return read_pose(self.start, convention=self.start_convention or "opencv", mesh=mesh)
 
 
-def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
+def limits_from_options(options: Document) -> Fields:
     """Arguments of :class:`PosePrior`, of which ``side`` and ``near`` are shorter forms; None
     means: not given."""
     given = {name: options[name] for name in PRIOR_OPTIONS if options.get(name) is not None}
@@ -365,7 +366,7 @@ def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
     return given
 
 
-def limits_from_cells(cells: Mapping[str, str]) -> dict[str, Any]:
+def limits_from_cells(cells: Mapping[str, str]) -> Fields:
     """:func:`limits_from_options` of texts such as "300 60"; empty ones are not given."""
     values = {}
     for name, text in cells.items():
@@ -376,7 +377,7 @@ def limits_from_cells(cells: Mapping[str, str]) -> dict[str, Any]:
     return limits_from_options(values)
 
 
-def prior_from_limits(limits: Mapping[str, Any]) -> "PosePrior | None":
+def prior_from_limits(limits: Document) -> "PosePrior | None":
     """The prior with these arguments; None if they limit nothing."""
     from ..geometry.pose_prior import PosePrior
 

@@ -8,7 +8,7 @@ fails leaves no result of another photograph.
 """
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any
 
 from ..errors import InvalidInputError, OutputError
 from ..formats.exports import ros, trackers
+from ..utils.aliases import Document
 from ..utils.files import check_writable, read_json, write_file
 from .store import to_json
 
@@ -123,7 +124,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _check_source(
-    folder: Path, before: Mapping[str, Any], source: Sequence[str], in_the_way: Sequence[Path]
+    folder: Path, before: Document, source: Sequence[str], in_the_way: Sequence[Path]
 ) -> None:
     """Refuse a run whose results would replace those of another source, or of a run of it that was
     stopped."""
@@ -175,7 +176,7 @@ def _identity(path: Path) -> object:
     return status.st_dev, status.st_ino
 
 
-def _check_owner(path: Path, command: str, written: Mapping[str, Any]) -> None:
+def _check_owner(path: Path, command: str, written: Document) -> None:
     """Refuse a file that ``command`` did not write."""
     owners = [
         name

@@ -2,14 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from ..errors import CurviregError
 from ..registration import Registrar, Registration
 from ..registration.photograph import Photograph
-from ..utils.aliases import Document
+from ..utils.aliases import Document, Fields
 from ..utils.files import write_file
 from ..utils.threads import map_on_threads
 from ..visualization import pose_glb, registration_sheet
@@ -25,7 +24,7 @@ MAX_GLB_FACES = 300_000
 
 def write_result(
     out: Path,
-    document: dict[str, Any],
+    document: Fields,
     registrar: Registrar,
     result: Registration,
     photograph: Photograph,
@@ -53,7 +52,7 @@ def write_result(
 
 def write_views(
     out: Path,
-    document: dict[str, Any],
+    document: Fields,
     registrar: Registrar,
     result: Registration,
     photographs: Sequence[Photograph | CurviregError],
@@ -100,7 +99,7 @@ def views_glb(
 
 def _write(
     out: Path,
-    document: dict[str, Any],
+    document: Fields,
     faces: int,
     overlay: Callable[[], bytes],
     scene: Callable[[], bytes],

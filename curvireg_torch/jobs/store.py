@@ -11,6 +11,7 @@ from ..errors import InvalidInputError, OutputError
 from ..utils.files import write_file
 
 Row = dict[str, Any]
+Rows = Sequence[Row]
 
 
 def has_pose(row: Mapping[str, Any]) -> bool:

@@ -466,7 +466,7 @@ class Session:
         boxes = [view.box for view in registration.views]
         return registration, document, photographs, boxes
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Fields:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done
         by hand."""
         result = self.shot.require_result()

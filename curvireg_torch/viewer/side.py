@@ -3,7 +3,7 @@ files and box."""
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,6 +15,7 @@ from ..errors import MAX_VIEWER_FACES
 from ..geometry import Camera, rotation_error
 from ..jobs.store import to_json
 from ..registration.confidence import two_decimals
+from ..utils.aliases import Document
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
 from ..visualization.words import (
@@ -178,7 +179,7 @@ class Answers(Panel):
             for label, repair in self._repairs(document).items():
                 button(label, repair, label.lower().replace(" ", "-"))
 
-    def _lines(self, document: Mapping[str, Any]) -> list[str]:
+    def _lines(self, document: Document) -> list[str]:
         """What is said of the answer's pose."""
         shot = self.session.shot
         result = shot.require_result()
@@ -211,7 +212,7 @@ class Answers(Panel):
             lines += [f"{name}: {words}" for name, words in told if words]
         return [*lines, *document["warnings"], *remarks(document), *result.answer.edits]
 
-    def _repairs(self, document: Mapping[str, Any]) -> dict[str, Callable[[], None]]:
+    def _repairs(self, document: Document) -> dict[str, Callable[[], None]]:
         """What one click can do about what the page says of the answer."""
         session = self.session
         box = document["corrected_box"]
