@@ -272,9 +272,12 @@ def register_list(
 def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Counts:
     shown = []
     failures = []
-    more = [BEST_MESH] if any(len(entry.meshes) > 1 for entry in entries) else []
-    numbered = INSTANCE_COLUMNS if any(entry.instances > 1 for entry in entries) else ()
-    lines: list[Sequence[object]] = [[*entries[0].cells, *RESULT_COLUMNS, *more, *numbered]]
+    columns = [*entries[0].cells, *RESULT_COLUMNS]
+    if any(len(entry.meshes) > 1 for entry in entries):
+        columns.append(BEST_MESH)
+    if any(entry.instances > 1 for entry in entries):
+        columns += INSTANCE_COLUMNS
+    lines: list[Sequence[object]] = [columns]
     for entry, row in zip(entries, _rows(entries, store), strict=True):
         number = row["row"]
         message = row["message"]
@@ -291,9 +294,9 @@ def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Co
             reason = message if entry.name in message else f"{entry.name}: {message}"
             failures.append(f"row {number}: {reason}".encode(errors="backslashreplace").decode())
         for instance, found in enumerate(objects, start=1):
-            cells = [*entry.cells.values(), *_result_cells(found)]
-            cells += [row.get("mesh", "") for _ in more]
-            lines.append([*cells, *(_instance_cells(instance, found) if numbered else ())])
+            # the list's own cells count where its columns have names of columns that are left out
+            cells = {BEST_MESH: row.get("mesh"), **_result_cells(instance, found), **entry.cells}
+            lines.append([cells.get(column) for column in columns])
     counts = Counts(Counter(shot.kind for shot in shown), tuple(failures))
     write_sheet(out / "index.html", str(counts), shown, table="results.csv")
     store.rewrite(_rows(entries, store))
@@ -316,24 +319,19 @@ def _objects(row: Row) -> list[Row]:
     return [{**row, **instance} for instance in row["detection"]["instances"]]
 
 
-def _instance_cells(number: int, row: Row) -> list[str]:
-    """Number and box of an object; empty without a pose."""
+def _result_cells(number: int, row: Row) -> Row:
+    """The cells of an object and its number, by their columns; without a pose most are left
+    out."""
     if not has_pose(row):
-        return [""] * len(INSTANCE_COLUMNS)
+        return {"verdict": row["verdict"], "message": row["message"], "reliable": "false"}
+    pose = [*chain(*row["rotation"]), *(row["translation"] or [None] * 3)]
     box = row.get("box") or row["inputs"]["box"]
-    return [str(number), *map(str, box)]
-
-
-def _result_cells(row: Row) -> list[str]:
-    if not has_pose(row):
-        return [row["verdict"], row["message"], "", "false", *[""] * 13]
-    confidence = "" if row["confidence"] is None else str(row["confidence"])
-    pose = [*(v for line in row["rotation"] for v in line), *(row["translation"] or [""] * 3)]
-    return [
-        row["verdict"],
-        "; ".join(row["warnings"]),
-        confidence,
-        "true" if row["reliable"] else "false",
-        *map(str, pose),
-        exactness["words"] if (exactness := row.get("exactness")) else "",
-    ]
+    return {
+        "verdict": row["verdict"],
+        "message": "; ".join(row["warnings"]),
+        "confidence": row["confidence"],
+        "reliable": "true" if row["reliable"] else "false",
+        "exactness": (row.get("exactness") or {}).get("words"),
+        **dict(zip(POSE_COLUMNS, pose, strict=True)),
+        **dict(zip(INSTANCE_COLUMNS, [number, *box], strict=True)),
+    }

@@ -225,6 +225,7 @@ def test_names_are_in_the_order_of_their_numbers(tmp_path):
 def test_the_page_of_a_list_begins_with_the_surest_answers(tmp_path, monkeypatch):
     pose = {"rotation": eye(3).tolist(), "translation": None, "warnings": [], "message": ""}
     pose |= {"digests": {"request": "r", "photo": "p"}, "verdict": "unsure", "reliable": False}
+    pose["inputs"] = {"box": [0.0, 0.0, 9.0, 9.0]}
     rows = {
         "failed": {**pose, "verdict": "failed", "message": "no such file"},
         "unlikely": {**pose, "confidence": 0.0},
