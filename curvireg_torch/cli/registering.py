@@ -15,7 +15,7 @@ from ..jobs.lists import Counts, list_photographs, read_list, register_list
 from ..jobs.opening import open_registrar
 from ..jobs.options import RegisterOptions
 from ..jobs.photograph import prepare_views, register_entry
-from ..jobs.result_files import write_lost, write_views
+from ..jobs.result_files import write_lost
 from ..jobs.rigs import read_rig, register_rig
 from ..jobs.trackers import write_start
 from ..pipeline import field_digest
@@ -70,13 +70,13 @@ def register_views(options: RegisterOptions, arguments: argparse.Namespace) -> D
     rig = read_rig(arguments.views, options.meshes[0])
     photographs = prepare_views(rig)
     with opened_registrar(options) as (registrar, seconds):
-        result, document = register_rig(
-            arguments.views, rig, photographs, registrar, bank_seconds=seconds
-        )
-    document["mesh"] = str(options.meshes[result.mesh_index])
+        found = register_rig(arguments.views, rig, photographs, registrar, bank_seconds=seconds)
+    document = found.document
+    mesh_index = found.registration.mesh_index
+    document["mesh"] = str(options.meshes[mesh_index])
     if out is not None:
-        write_views(out, document, registrar, result, photographs)
-    _write_pose(arguments, document, registrar.of_mesh(result.mesh_index))
+        found.write(out)
+    _write_pose(arguments, document, registrar.of_mesh(mesh_index))
     if not arguments.json:
         print("pose in the world (model to world)")
         for view in document["photographs"]:

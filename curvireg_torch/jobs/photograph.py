@@ -28,13 +28,13 @@ from ..registration.result import Results
 from ..registration.several import register_prepared_views
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike
-from ..visualization import contour_overlay, plots
-from ..visualization.encoding import jpeg, shrink
+from ..visualization import contour_overlay, plots, pose_glb, registration_sheet
+from ..visualization.encoding import jpeg, png, shrink
 from .documents import detection_document, result_document
 from .entry import Entry, prepare, start_in_unit
 from .opening import load_bank
 from .outputs import output_folder
-from .result_files import write_result
+from .result_files import write_files
 
 __all__ = ["RegisteredPhotograph", "register"]
 
@@ -93,9 +93,24 @@ class RegisteredPhotograph(Registration):
     def write(self, folder: Path) -> None:
         """Write the files of :meth:`save` into a folder that :func:`.outputs.output_folder` has
         checked."""
-        write_result(
-            folder, self.document, self.registrar, self, self.photograph, copies=self.copies
+        mesh = self.registrar.of_mesh(self.mesh_index).bank.mesh
+        camera = self.document["camera"]
+        distorts = camera is not None and (
+            camera["model"] == "fisheye" or any(camera["distortion"])
         )
+        note = "Distortion of the lens removed." if distorts else ""
+
+        def overlay() -> bytes:
+            return png(
+                registration_sheet(
+                    self.registrar, self, self.photograph, note=note, copies=self.copies
+                )
+            )
+
+        def glb() -> bytes:
+            return pose_glb(mesh, *self.projection, self.image)
+
+        write_files(folder, self.document, len(mesh.faces), overlay, glb)
 
     def _repr_html_(self) -> str:
         """For notebooks: the overlay above the pose."""

@@ -1,6 +1,7 @@
 """The files of one result: ``result.json``, ``overlay.png`` and ``pose.glb``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -8,10 +9,11 @@ import torch
 from ..errors import CurviregError
 from ..registration import Registrar, Registration
 from ..registration.photograph import Photograph
+from ..registration.result import PhotographPose
+from ..registration.target import Target
 from ..utils.aliases import Document, Fields
 from ..utils.files import write_file
 from ..utils.threads import map_on_threads
-from ..visualization import pose_glb, registration_sheet
 from ..visualization.encoding import png
 from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
@@ -22,92 +24,69 @@ from .store import to_json
 MAX_GLB_FACES = 300_000
 
 
-def write_result(
+@dataclass(frozen=True)
+class RegisteredViews:
+    """One pose in several photographs, of which errors are those that cannot be used, that can be
+    drawn and saved; ``document`` is the content of ``result.json``."""
+
+    registrar: Registrar
+    registration: Registration
+    photographs: Sequence[Photograph | CurviregError]
+    document: Fields
+
+    @property
+    def _target(self) -> Target:
+        return self.registrar.of_mesh(self.registration.mesh_index)
+
+    def write(self, out: Path) -> None:
+        """:func:`write_files` of the pose."""
+        faces = len(self._target.bank.mesh.faces)
+        write_files(out, self.document, faces, self.overlay, self.glb)
+
+    def overlay(self) -> bytes:
+        """``overlay.png``: the photographs that could be read, with the contours at the pose."""
+        shown = []
+        for row, item, pose in self._views():
+            if isinstance(item, Photograph):
+                score = "" if pose.edge_support is None else f"edge support {pose.edge_support:.2f}"
+                box = None if pose.box is None else pose.box.tolist()
+                projection = pose.T_cam_from_model, item.K
+                words = f"{row['name']}: {pose.failure or score}"
+                shown.append((projection, item.image, box, words))
+        return png(views_sheet(self._target.describer, shown))
+
+    def glb(self) -> bytes:
+        """``pose.glb``, with the cameras of the photographs that count."""
+        assert self.registration.transform is not None
+        cameras = []
+        for row, item, pose in self._views():
+            if isinstance(item, Photograph) and not pose.failure:
+                T = torch.tensor(row["T_cam_from_world"], dtype=torch.float64)
+                cameras.append((T, item.K, item.image))
+        return scene_glb(self._target.bank.mesh, self.registration.transform, cameras)
+
+    def _views(self) -> Iterator[tuple[Document, Photograph | CurviregError, PhotographPose]]:
+        """Of each photograph its row of the document, itself and its pose."""
+        rows = self.document["photographs"]
+        return zip(rows, self.photographs, self.registration.views, strict=True)
+
+
+def write_files(
     out: Path,
-    document: Fields,
-    registrar: Registrar,
-    result: Registration,
-    photograph: Photograph,
-    *,
-    copies: Sequence[Registration] = (),
-) -> None:
-    """Write the files of a result into the folder ``out``, which :func:`.outputs.output_folder` has
-    emptied of older ones; ``document`` is the content of ``result.json``.
-
-    The other arguments are those of :func:`curvireg_torch.visualization.registration_sheet`.
-    :class:`OutputError` if a file cannot be written.
-    """
-    mesh = registrar.of_mesh(result.mesh_index).bank.mesh
-    camera = document["camera"]
-    distorts = camera is not None and (camera["model"] == "fisheye" or any(camera["distortion"]))
-    note = "Distortion of the lens removed." if distorts else ""
-    _write(
-        out,
-        document,
-        len(mesh.faces),
-        lambda: png(registration_sheet(registrar, result, photograph, note=note, copies=copies)),
-        lambda: pose_glb(mesh, *result.projection, photograph.image),
-    )
-
-
-def write_views(
-    out: Path,
-    document: Fields,
-    registrar: Registrar,
-    result: Registration,
-    photographs: Sequence[Photograph | CurviregError],
-) -> None:
-    """Write the files of one pose in several photographs."""
-    faces = len(registrar.of_mesh(result.mesh_index).bank.mesh.faces)
-    arguments = (registrar, result, photographs, document)
-    _write(out, document, faces, lambda: views_picture(*arguments), lambda: views_glb(*arguments))
-
-
-def views_picture(
-    registrar: Registrar,
-    result: Registration,
-    photographs: Sequence[Photograph | CurviregError],
     document: Document,
-) -> bytes:
-    """``overlay.png`` of several photographs: those that could be read, with the contours at the
-    pose."""
-    shown = []
-    for row, item, pose in zip(document["photographs"], photographs, result.views, strict=True):
-        if isinstance(item, Photograph):
-            score = "" if pose.edge_support is None else f"edge support {pose.edge_support:.2f}"
-            box = None if pose.box is None else pose.box.tolist()
-            projection = pose.T_cam_from_model, item.K
-            shown.append((projection, item.image, box, f"{row['name']}: {pose.failure or score}"))
-    return png(views_sheet(registrar.of_mesh(result.mesh_index).describer, shown))
-
-
-def views_glb(
-    registrar: Registrar,
-    result: Registration,
-    photographs: Sequence[Photograph | CurviregError],
-    document: Document,
-) -> bytes:
-    """``pose.glb`` of several photographs, with the cameras of those that count."""
-    assert result.transform is not None
-    cameras = []
-    for row, item, pose in zip(document["photographs"], photographs, result.views, strict=True):
-        if isinstance(item, Photograph) and not pose.failure:
-            T = torch.tensor(row["T_cam_from_world"], dtype=torch.float64)
-            cameras.append((T, item.K, item.image))
-    return scene_glb(registrar.of_mesh(result.mesh_index).bank.mesh, result.transform, cameras)
-
-
-def _write(
-    out: Path,
-    document: Fields,
     faces: int,
     overlay: Callable[[], bytes],
-    scene: Callable[[], bytes],
+    glb: Callable[[], bytes],
 ) -> None:
-    """Write ``result.json``, then the picture and the scene, drawn beside each other."""
+    """Write ``result.json``, then the picture and the scene, drawn beside each other, into the
+    folder ``out``, which :func:`.outputs.output_folder` has emptied of older ones. A scene of many
+    ``faces`` is left out.
+
+    :class:`OutputError` if a file cannot be written.
+    """
     # first: no failure to draw it loses the result
     write_file(out / "result.json", to_json(document).encode())
-    files = [("overlay.png", overlay), *([("pose.glb", scene)] if faces <= MAX_GLB_FACES else [])]
+    files = [("overlay.png", overlay), *([("pose.glb", glb)] if faces <= MAX_GLB_FACES else [])]
 
     def attempt(file: tuple[str, Callable[[], bytes]]) -> Exception | None:
         try:

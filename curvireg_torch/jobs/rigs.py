@@ -19,7 +19,7 @@ from ..data.cameras import Calibrations
 from ..errors import MAX_RIG_VIEWS, CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
 from ..geometry.cameras import transform
-from ..registration import Registrar, Registration
+from ..registration import Registrar
 from ..registration.photograph import Photograph
 from ..utils.checks import check_pose
 from ..utils.files import FindFile, check_table_size, finite_numbers, found_in, read_csv, read_json
@@ -27,6 +27,7 @@ from .documents import result_document
 from .entry import Entry
 from .lists import BOX, CAMERA, POSE_COLUMNS, given_camera, numbers_of
 from .photograph import register_views
+from .result_files import RegisteredViews
 
 ROTATION = POSE_COLUMNS[:9]
 TRANSLATION = POSE_COLUMNS[9:]
@@ -246,9 +247,9 @@ def register_rig(
     registrar: Registrar,
     *,
     bank_seconds: float,
-) -> tuple[Registration, dict[str, Any]]:
+) -> RegisteredViews:
     """Register the ``photographs`` of a rig together, see :meth:`.Registrar.register_views`; an
-    error is why one cannot be used. Returns the registration and its document."""
+    error is why one cannot be used."""
     start = time.perf_counter()
     with _about(path):
         result = register_views(rig, photographs, registrar)
@@ -262,4 +263,4 @@ def register_rig(
             camera = item.camera or camera
         row |= {"name": view.name, "photo": str(view.photo), "camera": camera.describe()}
         row["T_cam_from_world"] = T.tolist()
-    return result, document
+    return RegisteredViews(registrar, result, photographs, document)

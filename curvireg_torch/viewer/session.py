@@ -459,12 +459,12 @@ class Session:
             view = replace(shot.view, photo=Path(self.name(shot.path)), box=shot.box)
             views.append(view)
             photographs.append(_prepared(view, shot, view.camera))
-        registration, document = register_rig(
+        found = register_rig(
             Path(self.rig_name), views, photographs, registrar, bank_seconds=seconds
         )
-        document["mesh"] = self.name(request.meshes[0])
-        boxes = [view.box for view in registration.views]
-        return registration, document, photographs, boxes
+        found.document["mesh"] = self.name(request.meshes[0])
+        boxes = [view.box for view in found.registration.views]
+        return found.registration, found.document, photographs, boxes
 
     def document(self) -> Fields:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done

@@ -17,7 +17,7 @@ from ..geometry import rotation_error, rotation_from_axis_angle
 from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..jobs.entry import Entry
 from ..jobs.options import RegisterOptions
-from ..jobs.result_files import views_glb, views_picture
+from ..jobs.result_files import RegisteredViews
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..registration.photograph import Photograph
 from ..utils.likes import BoxLike
@@ -93,6 +93,11 @@ class Result:
             axis=None,
             pair_probability=None,
         )
+
+    @property
+    def views(self) -> RegisteredViews:
+        """The answer in the photographs of a rig."""
+        return RegisteredViews(self.registrar, self.chosen, self.photographs, self.document)
 
     def centre(self, T: Tensor) -> Tensor:
         """(3,) of the object in the camera, at a (4, 4) pose."""
@@ -271,16 +276,14 @@ class Shot:
         """The answer as a GLB file, see :func:`curvireg_torch.visualization.pose_glb`."""
         result = self.require_result()
         if result.photographs:
-            return views_glb(result.registrar, result.chosen, result.photographs, result.document)
+            return result.views.glb()
         return pose_glb(result.registrar.bank.mesh, *result.answer.pose.projection, self.image)
 
     def overlay(self) -> bytes:
         """The contours at the answer on the photograph, or on those of the rig, as a PNG file."""
         result = self.require_result()
         if result.photographs:
-            return views_picture(
-                result.registrar, result.chosen, result.photographs, result.document
-            )
+            return result.views.overlay()
         return png(
             contour_overlay(result.registrar, result.answer.pose, self.image, self.require_box())
         )

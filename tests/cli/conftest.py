@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from curvireg_torch.cli import main
-from curvireg_torch.jobs import result_files
+from curvireg_torch.jobs import photograph
 from tests._support.lists import box_of, write_files
 
 PICTURE = np.zeros((8, 8, 3), np.uint8)
@@ -20,7 +20,7 @@ def folder(tmp_path_factory):
 def _overlay(request, monkeypatch):
     """It takes as long as a registration: it is drawn where a test asks for ``drawn``."""
     if "drawn" not in request.fixturenames:
-        monkeypatch.setattr(result_files, "registration_sheet", lambda *_, **__: PICTURE)
+        monkeypatch.setattr(photograph, "registration_sheet", lambda *_, **__: PICTURE)
 
 
 @pytest.fixture

@@ -145,7 +145,7 @@ def test_a_file_that_cannot_be_drawn_costs_no_other(
 ):
     threads(n)
     fail = Mock(side_effect=InvalidInputError("it cannot be drawn"))
-    monkeypatch.setattr(f"curvireg_torch.jobs.result_files.{draws}", fail)
+    monkeypatch.setattr(f"curvireg_torch.jobs.photograph.{draws}", fail)
     assert register_one("--no-refine", "--camera", *CAMERA) == 2
     written = {path.name for path in (tmp_path / "out").iterdir()} - {MARKER}
     assert written == {"result.json", "overlay.png", "pose.glb"} - {file}

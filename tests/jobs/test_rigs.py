@@ -277,8 +277,8 @@ def test_rows_of_a_rig_have_the_camera_at_the_size_of_the_photograph(tmp_path, m
     ]
     monkeypatch.setattr(rigs, "register_views", lambda *_: None)
     monkeypatch.setattr(rigs, "result_document", lambda *_: {"photographs": [{}, {}]})
-    _, document = rigs.register_rig(Path("rig"), rig, prepare_views(rig), None, bank_seconds=0.0)
-    first, second = document["photographs"]
+    found = rigs.register_rig(Path("rig"), rig, prepare_views(rig), None, bank_seconds=0.0)
+    first, second = found.document["photographs"]
     assert first["camera"] == camera.at((360, 480)).describe() != camera.describe()
     assert second["camera"] == camera.describe()
     assert (first["name"], second["T_cam_from_world"][0]) == ("0.png", [2.0, 0.0, 0.0, 0.0])
