@@ -12,15 +12,14 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from ..errors import CurviregError, CurviregWarning
 from ..jobs.options import with_advice
-from ..utils.files import as_stored, terminable
+from ..utils.files import terminable
 from ..version import __version__
 from . import commands, follow, register
-from .options import CONFLICTS, Parser, conflict, given_options, join_numbers
+from .options import CONFLICTS, Parser, conflict, given_options, join_numbers, stored_path
 
 __all__ = ["build_parser", "main", "parse"]
 
@@ -89,14 +88,9 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     arguments, rest = parser.parse_known_args(join_numbers(argv))
     if hasattr(arguments, "paths") and not any(word.startswith("-") for word in rest):
         # argparse does not collect positionals that follow an option
-        arguments.paths += map(Path, rest)
+        arguments.paths += map(stored_path, rest)
     elif rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    for name, value in vars(arguments).items():
-        if isinstance(value, Path):
-            setattr(arguments, name, as_stored(value))
-        elif isinstance(value, list) and all(isinstance(path, Path) for path in value):
-            setattr(arguments, name, [as_stored(path) for path in value])
     if hasattr(arguments, "paths") and (problem := register.complete(arguments)):
         parser.error(f"register: {problem}")
     if problem := conflict(CONFLICTS, given_options(arguments)):

@@ -20,6 +20,7 @@ from ..jobs.options import (
     whole_number,
 )
 from ..utils.aliases import Fields
+from ..utils.files import as_stored
 
 FIELDS = {
     option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata
@@ -56,9 +57,14 @@ def add_command(commands: Any, name: str, *examples: str, **how: Any) -> Any:
     return parser
 
 
+def stored_path(text: str) -> Path:
+    """The path that is meant by a word of the command line, see :func:`.as_stored`."""
+    return as_stored(Path(text))
+
+
 def add_path(parser: Any, name: str, metavar: str, **how: Any) -> None:
     """Add an argument that is a path."""
-    parser.add_argument(name, type=Path, metavar=metavar, **how)
+    parser.add_argument(name, type=stored_path, metavar=metavar, **how)
 
 
 def add_options(parser: Any, *names: str, **help_texts: str) -> None:
@@ -70,7 +76,7 @@ def add_options(parser: Any, *names: str, **help_texts: str) -> None:
         if isinstance(kind, Numbers):
             how["metavar"] = re.sub(r"[][]", "", kind.names)
         elif kind is Path:
-            how.setdefault("metavar", "FILE")
+            how = {"metavar": "FILE", **how, "type": stored_path}
         parser.add_argument(flag, dest=name, **how)
 
 
