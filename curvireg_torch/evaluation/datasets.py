@@ -1,16 +1,15 @@
 """Evaluation of a dataset: results to disk, then scores from disk."""
 
 import math
-import platform
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
+from ..jobs.documents import VERSIONS
 from ..jobs.outputs import output_folder
 from ..jobs.runner import results_digest, run_entries, thumbnail_of
 from ..jobs.store import ResultStore, Row, Rows, has_pose, to_json
@@ -164,11 +163,7 @@ def report(
         "protocol": settings["protocol"],
         "limit": limit,
         "settings": settings,
-        "versions": {
-            "curvireg_torch": __version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-        },
+        "versions": VERSIONS,
         "seconds": {**seconds, "register_each": seconds["register"] / len(rows) if rows else None},
     }
     for name in filter(None, ("predictions.csv", benchmark.results_name(settings))):

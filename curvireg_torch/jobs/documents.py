@@ -15,6 +15,11 @@ from ..version import __version__
 SCHEMA = 5
 # Keys of result.json that have another name in the lines of results.jsonl
 LINE_KEYS = {"hypotheses": "top", "no_match_probability": "none"}
+VERSIONS = {
+    "curvireg_torch": __version__,
+    "python": platform.python_version(),
+    "torch": torch.__version__,
+}
 CONVENTIONS = {  # docs/results.md describes all keys
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of "
     "the mesh file",
@@ -47,9 +52,7 @@ def result_document(result: Registration, target: Target, seconds: Mapping[str, 
         "pipeline": target.pipeline.describe(),
         "seconds": dict(seconds),
         "versions": {
-            "curvireg_torch": __version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
+            **VERSIONS,
             "kornia": version("kornia"),
             "trimesh": version("trimesh"),
         },
