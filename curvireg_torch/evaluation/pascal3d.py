@@ -55,26 +55,24 @@ class Pascal3DBenchmark(Benchmark):
     }
     flags = ("truncated", "occluded", "difficult")
     columns = (
-        *(
-            "image_id",
-            "object_index",
-            "category",
-            "cad_index",
-            "mesh",
-            "azimuth",
-            "elevation",
-            "theta",
-        ),
-        *(
-            "true_azimuth",
-            "true_elevation",
-            "true_theta",
-            "error_deg",
-            "symmetric_error_deg",
-            "score",
-            "confidence",
-        ),
-        *(*flags, "failed", "seconds"),
+        "image_id",
+        "object_index",
+        "category",
+        "cad_index",
+        "mesh",
+        "azimuth",
+        "elevation",
+        "theta",
+        "true_azimuth",
+        "true_elevation",
+        "true_theta",
+        "error_deg",
+        "symmetric_error_deg",
+        "score",
+        "confidence",
+        *flags,
+        "failed",
+        "seconds",
     )
     dataset: Pascal3DPlus
 

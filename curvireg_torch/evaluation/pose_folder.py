@@ -17,17 +17,21 @@ class PoseFolderBenchmark(Benchmark):
     name = "web"
     label = "{category}/{object_index}"
     columns = (
-        *(
-            "category",
-            "object_index",
-            "image_id",
-            "azimuth",
-            "elevation",
-            "theta",
-            "true_azimuth",
-            "true_elevation",
-        ),
-        *("true_theta", "error_deg", "score", "confidence", "reliable", "failed", "seconds"),
+        "category",
+        "object_index",
+        "image_id",
+        "azimuth",
+        "elevation",
+        "theta",
+        "true_azimuth",
+        "true_elevation",
+        "true_theta",
+        "error_deg",
+        "score",
+        "confidence",
+        "reliable",
+        "failed",
+        "seconds",
     )
     dataset: PoseFolder
 
