@@ -176,7 +176,7 @@ def inspect(
         n: photographs; 0 leaves them out.
         seed: of the photographs.
         with_camera: whether the camera is known.
-        compare: also register a quarter of the photographs under other conditions.
+        compare: also register a fifth of the photographs under other conditions.
         pipeline: settings; ``Pipeline().with_pose_prior("upright")`` for objects that stand as in
             their file.
         renderer, device: of the views, see :class:`Registrar`.
@@ -220,8 +220,10 @@ def inspect(
         pictures = [_background(picture) for picture in backgrounds]
         upright = registrar.pipeline.views.pose == "upright"
         generate = PhotographGenerator(clean, seed, upright, pictures, clutter)
-        how: Fields = {"with_camera": with_camera, "compare": compare, "report": report}
-        return replace(found, trial=run_trial(registrar, generate, n, **how))
+        trial = run_trial(
+            registrar, generate, n, with_camera=with_camera, compare=compare, report=report
+        )
+        return replace(found, trial=trial)
 
 
 def look_alikes_of(
