@@ -120,7 +120,7 @@ def _run_inspect(arguments: argparse.Namespace) -> int:
             )
         content = json.dumps(report.to_dict(), indent=2) + "\n"
         write_file(arguments.out / "inspect.json", content.encode())
-        page = report_page(report, report.registrar, title=arguments.mesh.name)
+        page = report_page(report, title=arguments.mesh.name)
         write_file(arguments.out / "inspect.html", page.encode(errors="backslashreplace"))
     print(
         "\n".join(

@@ -1,7 +1,9 @@
 """What a command is doing."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+
+from ..utils.aliases import Progress
 
 STAGES = {
     "detection": "detecting the object",
@@ -13,7 +15,7 @@ STAGES = {
 
 
 @contextmanager
-def shown_stages(*, shown: bool) -> Iterator[Callable[[str, int, int], None]]:
+def shown_stages(*, shown: bool) -> Iterator[Progress]:
     """Context with a function that shows on a terminal how much of a stage is done."""
     from tqdm import tqdm
 

@@ -51,24 +51,23 @@ def report_lines(report: Inspection) -> list[str]:
     return lines
 
 
-def report_page(report: Inspection, registrar: Registrar | None, *, title: str) -> str:
+def report_page(report: Inspection, *, title: str) -> str:
     """The report as an HTML page.
 
     Args:
-        report: of the mesh.
-        registrar: of the same mesh, which draws the pictures; None draws none.
+        report: of the mesh; without its registrar, the page has no pictures.
         title: name of the mesh.
     """
     parts = [_warnings(report.warnings), _table(_fact_rows(report.facts))]
     if report.facts.symmetries:
         parts += ["<h2>Symmetries</h2>", _symmetry_table(report.facts)]
     if report.pairs:
-        parts += ["<h2>Views that look alike</h2>", _pairs(report, registrar)]
+        parts += ["<h2>Views that look alike</h2>", _pairs(report)]
     if report.trial is not None:
         parts += [
             "<h2>What to expect</h2>",
             _expectation(report),
-            _confusions(report.trial.outcomes, registrar),
+            _confusions(report.trial.outcomes, report.registrar),
         ]
     return _PAGE.format(title=html.escape(title), body="\n".join(parts))
 
@@ -133,7 +132,7 @@ def _symmetry_table(facts: MeshFacts) -> str:
     return _table(rows)
 
 
-def _pairs(report: Inspection, registrar: Registrar | None) -> str:
+def _pairs(report: Inspection) -> str:
     count = (
         f"From {len(report.alike)} of {len(report.pairs)} directions another side looks alike: "
         "their edges differ by"
@@ -143,11 +142,9 @@ def _pairs(report: Inspection, registrar: Registrar | None) -> str:
         f"<p>{count} no more than those of one pose and the same pose, turned by 3 degrees."
         f"{told if report.facts.is_coloured and report.alike else ''}</p>"
     ]
-    if registrar is None:
-        return lines[0]
-    shown = report.pairs[: MOST_PAIRS if report.alike else FEW_PAIRS]
-    for pair in shown:
-        lines.append(_pair_figure(registrar, pair))
+    if report.registrar is not None:
+        shown = report.pairs[: MOST_PAIRS if report.alike else FEW_PAIRS]
+        lines += [_pair_figure(report.registrar, pair) for pair in shown]
     return "\n".join(lines)
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -15,14 +15,14 @@ from ..matching import cached_bank
 from ..mesh import as_mesh
 from ..pipeline import Pipeline
 from ..registration import Registrar
-from ..utils.aliases import Fields
+from ..utils.aliases import Fields, Progress
 from ..utils.checks import check_integer
 from ..utils.likes import MeshLike
 from ..utils.threads import one_torch_thread
 from .facts import MeshFacts, mesh_facts
 from .look_alikes import LookAlike, confused_sides, look_alikes
 from .photographs import SIZE, UPRIGHT, PhotographGenerator
-from .trial import Report, Trial, report_nothing, run_trial
+from .trial import Trial, report_nothing, run_trial
 
 ELEVATIONS = (-90.0, -45.0, 0.0, 45.0, 90.0)  # Borders of the ranges of the report, degrees
 PIXELS_ACROSS = (0.0, 128.0, 192.0, 256.0, math.inf)
@@ -167,7 +167,7 @@ def inspect(
     device: torch.device | str = "cpu",
     backgrounds: Sequence[Any] = (),
     clutter: bool = False,
-    progress: Report | None = None,
+    progress: Progress | None = None,
 ) -> Inspection:
     """Examine a mesh, look for views that are alike, and register generated photographs of it.
 
@@ -213,7 +213,7 @@ def inspect(
                 clean, pipeline=pipeline, renderer=renderer, device=device, progress=report
             )
             registrar = Registrar(bank, mesh_is="exact", renderer=renderer)
-        pairs = look_alikes_of(registrar, partial(report, "look-alikes"))
+        pairs = look_alikes_of(registrar, report)
         found = replace(found, pairs=pairs, registrar=registrar)
         if n == 0:
             return found
@@ -226,10 +226,9 @@ def inspect(
         return replace(found, trial=trial)
 
 
-def look_alikes_of(
-    registrar: Registrar, report_progress: Callable[[int, int], object] = lambda *_: None
-) -> tuple[LookAlike, ...]:
-    """:func:`.look_alikes` of a registrar's mesh, from where its views are looked at."""
+def look_alikes_of(registrar: Registrar, report: Progress) -> tuple[LookAlike, ...]:
+    """:func:`.look_alikes` of a registrar's mesh, from where its views are looked at; the stage is
+    called "look-alikes"."""
     mesh = registrar.bank.mesh
     upright = registrar.pipeline.views.pose == "upright"
     return look_alikes(
@@ -237,7 +236,7 @@ def look_alikes_of(
         registrar.describer,
         None if mesh.has_colours else registrar.symmetries_of(exact=True),
         elevations=UPRIGHT if upright else (-90.0, 90.0),
-        report_progress=report_progress,
+        report_progress=partial(report, "look-alikes"),
     )
 
 

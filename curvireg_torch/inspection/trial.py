@@ -23,7 +23,7 @@ from ..mesh import Mesh, mesh_centre
 from ..registration import Registrar, Registration
 from ..registration.stages import share_of_worker
 from ..synthetic import synthesize_photograph
-from ..utils.aliases import Fields
+from ..utils.aliases import Fields, Progress
 from ..utils.threads import available_threads, map_on_threads
 from .photographs import (
     SIZE,
@@ -41,9 +41,6 @@ HINT_DEGREES = 45.0  # around a hint, within which the pose lies, as those of th
 HINT_ERROR = 30.0  # Degrees by which hints are off, at most
 SECOND_CAMERA = 60.0  # Degrees about the object between two photographs
 IDENTITY = torch.eye(3, dtype=torch.float64)[None]
-
-Report: TypeAlias = Callable[[str, int, int], object]
-"""Is called with a stage, done and total."""
 
 Register: TypeAlias = Callable[[Sequence[GeneratedPhotograph]], list["Outcome"]]
 """The outcomes of photographs."""
@@ -148,7 +145,7 @@ def run_trial(
     *,
     with_camera: bool = True,
     compare: bool = True,
-    report: Report = report_nothing,
+    report: Progress = report_nothing,
 ) -> Trial:
     """Register photographs 0 to ``count - 1`` of the registrar's mesh, in batches, and a
     fifth of them without a camera, with a hint, with a second photograph, and without the mesh's
@@ -259,7 +256,7 @@ class _Setup:
         return Outcome(photograph, result, error, elevation)
 
 
-def _conditions(setup: _Setup, generate: PhotographGenerator, report: Report) -> Conditions:
+def _conditions(setup: _Setup, generate: PhotographGenerator, report: Progress) -> Conditions:
     """What a camera, a hint, a second photograph and a print add, or what is lost without them.
 
     A print makes poses differ that look alike without: with and without it, each counts.

@@ -1,6 +1,6 @@
 """The registrar of some mesh files or banks, as options ask for it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +8,7 @@ from ..errors import BankError
 from ..matching import ViewBank, cached_bank
 from ..pipeline import Pipeline
 from ..registration import Registrar
+from ..utils.aliases import Progress
 from .options import RegisterOptions
 
 
@@ -15,7 +16,7 @@ def open_registrar(
     options: RegisterOptions,
     meshes: Sequence[Path],
     *,
-    progress: Callable[[str, int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> Registrar:
     """The registrar of mesh files or banks; ``progress`` is called while banks are built, instead
     of showing a bar."""
@@ -46,7 +47,7 @@ def _open_bank(
     options: RegisterOptions,
     mesh: Path,
     pipeline: Pipeline,
-    progress: bool | Callable[[str, int, int], object],
+    progress: bool | Progress,
 ) -> ViewBank:
     if mesh.suffix != ".safetensors":
         loaded = options.load_mesh(mesh)

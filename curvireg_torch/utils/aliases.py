@@ -1,6 +1,6 @@
 """Names of types that many signatures share; those of arrays are in :mod:`.arrays`."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from os import PathLike
 from typing import Any
 
@@ -12,6 +12,9 @@ Document = Mapping[str, Any]
 
 PathName = str | PathLike[str]
 """The path of a file."""
+
+Progress = Callable[[str, int, int], object]
+"""Is called with a stage, and how much of it is done, of how much in all."""
 
 Size = tuple[int, int]
 """Height and width in px."""

@@ -2,7 +2,6 @@
 
 import asyncio
 import traceback
-from functools import partial
 
 from ..errors import CurviregError
 from ..inspection.facts import mesh_facts
@@ -74,7 +73,7 @@ class Examination:
         if facts.is_hopeless:
             return Inspection(facts).in_brief
         registrar = self.session.open_registrar(key, self._report)
-        pairs = look_alikes_of(registrar, partial(self._report, "look-alikes"))
+        pairs = look_alikes_of(registrar, self._report)
         return Inspection(facts, pairs).in_brief
 
     def close(self) -> None:

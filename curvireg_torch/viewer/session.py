@@ -5,7 +5,7 @@ import math
 import re
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from ..matching import ViewBank
 from ..mesh import Mesh, mesh_centre, mesh_radius
 from ..registration import Registrar, Registration
 from ..registration.photograph import Photograph
-from ..utils.aliases import Fields
+from ..utils.aliases import Fields, Progress
 from ..utils.files import only_in
 from ..visualization.pose_glb import mesh_glb
 from .programs import command_line, python_program
@@ -495,9 +495,7 @@ class Session:
         if self.cancelled:
             raise CurviregError("stopped")
 
-    def open_registrar(
-        self, request: RegisterOptions, report: Callable[[str, int, int], object]
-    ) -> Registrar:
+    def open_registrar(self, request: RegisterOptions, report: Progress) -> Registrar:
         """The registrar of a mesh and options; the last one is reused, and one thread at a time
         builds one."""
         key = registrar_key(request)

@@ -354,15 +354,15 @@ def test_number_below_zero_is_refused():
 
 def test_page_groups_symmetries_by_their_turn():
     can = mesh_facts(trimesh.creation.cylinder(0.3, 1.0, sections=72))
-    page = report_page(Inspection(can), None, title="can")
+    page = report_page(Inspection(can), title="can")
     assert page.count("<tr><td>180°</td><td>37</td>") == 1
     assert page.count("<tr><td>10°</td><td>2</td>") == 1
     assert "in 1 part, closed" in page
 
 
 def test_page_escapes_names(inspected):
-    registrar, report, _ = inspected
-    assert "<b>" not in report_page(report, registrar, title="<b>x").replace("<body>", "")
+    _, report, _ = inspected
+    assert "<b>" not in report_page(report, title="<b>x").replace("<body>", "")
     assert any(line.startswith("size:") for line in report_lines(report))
 
 
