@@ -218,23 +218,25 @@ class Answers(Panel):
         box = document["corrected_box"]
         found = dict[str, Callable[[], None]]()
         shot = session.shot
-        options = session.options
+        limits = session.options.limits
 
-        def search_with(**changes: Any) -> None:
-            shot.set_box(changes.pop("box", shot.box))
-            session.options = replace(session.options, **changes)
-            self.workspace.start_search()
+        def search_after(change: Callable[[], object]) -> Callable[[], None]:
+            def repair() -> None:
+                change()
+                self.workspace.start_search()
+
+            return repair
 
         if document.get("prior", {}).get("contradiction") is not None:
-            limits = options.limits
-            front = {name: value for name, value in limits.items() if name == "front"}
             if "viewpoint" in limits:
                 azimuth, *rest = limits["viewpoint"]
                 around = {**limits, "viewpoint": ((azimuth + 180.0) % 360.0, *rest)}
-                found["Turn the prior around"] = lambda: search_with(limits=around)
-            found["Search without the prior"] = lambda: search_with(limits=front)
+                turned = partial(session.set_limits, **around)
+                found["Turn the prior around"] = search_after(turned)
+            found["Search without the prior"] = search_after(session.remove_limits)
         if box is not None:
-            found["Search with that box"] = lambda: search_with(box=tuple(round(v, 1) for v in box))
+            corrected = numbers([round(v, 1) for v in box])
+            found["Search with that box"] = search_after(partial(shot.set_box, corrected))
         return found
 
     async def _draw_cards(self, shot: Shot) -> None:
