@@ -1,8 +1,9 @@
 """The command ``curvireg``.
 
 Each command has a function ``add_*`` that adds it to the subparsers, and one that runs it, which
-imports heavy modules, so that help and mistakes in options appear at once, and raises
-:class:`CurviregError` for unusable input.
+raises :class:`CurviregError` for unusable input. Heavy modules, and those that import them at their
+top (``registering``, ``following``, ``printing``), are imported there, so that help and mistakes in
+options appear at once.
 """
 
 import argparse

@@ -181,8 +181,8 @@ CONFLICTS = {
 
 
 def complete(arguments: argparse.Namespace) -> str | None:
-    """Divide ``paths`` into ``photos`` and ``meshes``; returns what is wrong with the options
-    together, or None."""
+    """Divide ``paths`` into ``photos`` and ``meshes``, and tell whether there is one result
+    ``alone``; returns what is wrong with the options together, or None."""
     rig = arguments.views
     listed = arguments.list is not None or rig is not None
     arguments.photos = [] if listed else arguments.paths if arguments.mesh else arguments.paths[:-1]
@@ -200,11 +200,12 @@ def complete(arguments: argparse.Namespace) -> str | None:
             f"several by --mesh"
         )
     is_one = is_one_photograph(arguments.photos)
+    arguments.alone = rig is not None or (not listed and is_one)
     facts = {
         "listed": listed,
         "missing": not listed and not (arguments.photos and arguments.meshes),
         "one": is_one,
-        "alone": rig is not None or (not listed and is_one),
+        "alone": arguments.alone,
         "videos": any(photo.suffix.lower() in VIDEOS for photo in arguments.photos),
         "no_mesh": not arguments.meshes,
         "meshes": len(arguments.meshes) > 1,
@@ -221,12 +222,10 @@ def complete(arguments: argparse.Namespace) -> str | None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
-    if arguments.views is not None or (
-        arguments.list is None and is_one_photograph(arguments.photos)
-    ):
-        verdict = _register_alone(arguments)
-        is_enough = not arguments.strict or verdict in ENOUGH[arguments.need or "pose"]
-        return 0 if is_enough else NONE_RELIABLE
+    enough = ENOUGH[arguments.need or "pose"]
+    if arguments.alone:
+        is_enough = _register_alone(arguments) in enough
+        return NONE_RELIABLE if arguments.strict and not is_enough else 0
     options = _checked_options(arguments)
     from ..utils.threads import one_torch_thread
     from .registering import register_several
@@ -250,7 +249,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InvalidInputError(message, subject=arguments.list or "")
     if not arguments.strict:
         return 0
-    if not any(counts.verdicts.get(verdict) for verdict in ENOUGH[arguments.need or "pose"]):
+    if not any(counts.verdicts.get(verdict) for verdict in enough):
         return NONE_RELIABLE
     return SOME_FAILED if counts.failures else 0
 
