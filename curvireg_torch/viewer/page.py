@@ -88,8 +88,7 @@ def build_page(workspace: Workspace) -> None:
 class Steps(Panel):
     """What is there, what is missing, and the button that finds the pose."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        super().__init__(workspace)
+    def lay_out(self) -> None:
         self.cards = dict[str, Any]()
         self.facts = dict[str, Any]()
         self.messages = dict[str, Any]()
@@ -99,18 +98,20 @@ class Steps(Panel):
                 self.facts["rig"] = fact_line("rig-facts")
                 self.messages["rig"] = message_line("rig")
                 with region("div", "row below"):
-                    self.no_photo = button("Remove it", workspace.remove_photo, "no-photo", "quiet")
+                    self.no_photo = button(
+                        "Remove it", self.workspace.remove_photo, "no-photo", "quiet"
+                    )
                     self.restore = button(
-                        "Bring it back", workspace.restore_photo, "restore-photo", "quiet"
+                        "Bring it back", self.workspace.restore_photo, "restore-photo", "quiet"
                     )
                     self.no_rig = button(
-                        "Without the rig", lambda: workspace.open_rig(None), "no-rig", "quiet"
+                        "Without the rig", lambda: self.workspace.open_rig(None), "no-rig", "quiet"
                     )
             with self._step(2, "mesh"):
                 self._ask_for("mesh")
                 self.use_mm = button(
                     "Use mm",
-                    lambda: workspace.set_option("unit", "mm"),
+                    lambda: self.workspace.set_option("unit", "mm"),
                     "use-mm",
                     "quiet below",
                 )
@@ -122,7 +123,7 @@ class Steps(Panel):
         self.messages["file"] = message_line("file")
         with region("div", "go"):
             self.find = button("Find the pose", self._find, "register", "primary")
-            self.stop = button("Stop", workspace.stop, "stop")
+            self.stop = button("Stop", self.workspace.stop, "stop")
             self.bar = region(
                 "progress", "", max="1", value="0", aria_label="progress of the search"
             )

@@ -41,7 +41,6 @@ from .widgets import (
     show_value,
     text,
 )
-from .workspace import Workspace
 
 DOWNLOADS = {
     "picture": ("overlay.png", "image/png"),
@@ -99,8 +98,7 @@ class Answers(Panel):
     """The chosen answer with its verdict and its downloads, and a card of each answer that can be
     chosen."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        super().__init__(workspace)
+    def lay_out(self) -> None:
         with region(
             "section", "answers", aria_label="answer", data_testid="answers"
         ) as self.section:
@@ -275,8 +273,7 @@ class Inputs(Panel):
     """Input fields; what is typed or chosen goes into the session, and what changes there is
     shown."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        super().__init__(workspace)
+    def lay_out(self) -> None:
         self.selects: dict[str, Any] = {}
         with fold("Mesh and method", "options", is_open=True):
             for name, (label, choices) in CHOICES.items():
@@ -314,8 +311,7 @@ class CameraPanel(Panel):
     """The camera of all photographs without a rig: two fields, each sent by Enter or on leaving it,
     and where it is from."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        super().__init__(workspace)
+    def lay_out(self) -> None:
         with region("div", "fold"):  # a card, which names the camera when its fields are folded
             with fold("Camera", "camera"):
                 text("p", CAMERA_HINT, "facts")
@@ -404,8 +400,7 @@ class Preview(Panel):
     """The mesh in 3D. Turned with the mouse until it looks as in the photograph, it is a pose
     prior."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        super().__init__(workspace)
+    def lay_out(self) -> None:
         self.scene: Any = None
         self.mark = ""
         with fold("The model", "model", is_open=True) as self.section:
@@ -495,8 +490,7 @@ def _scene(fov: float, on_click: Callable[..., Any] | None = None) -> ui.scene:
 class Space(Panel):
     """Camera, photograph and mesh in 3D, to be turned with the mouse; drawn when asked for."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        super().__init__(workspace)
+    def lay_out(self) -> None:
         self.drawn: Answer | None = None
         with fold("The answer in 3D", "space", is_open=True) as self.section:
             self.place = region("div", "preview", data_testid="space")

@@ -29,7 +29,6 @@ from .widgets import (
     set_pressed,
     text,
 )
-from .workspace import Workspace
 
 PHOTO_SIDE = 2400  # px of the longer side of the displayed photograph, which can be zoomed
 THUMBNAIL_SIDE = 96  # px of the longer side of the small photographs
@@ -59,8 +58,7 @@ class Stage(Panel):
     """The photographs, one of which is large and can be zoomed; ``page.js`` sends what mouse,
     fingers and keys do."""
 
-    def __init__(self, workspace: Workspace) -> None:
-        super().__init__(workspace)
+    def lay_out(self) -> None:
         self.mode = "box"
         self.mask = np.zeros((1, 1), bool)
         # What a drag began with: the box or the pose, where, and whether it turns.
@@ -78,7 +76,7 @@ class Stage(Panel):
                 )
                 with region("div", "row"):
                     file_chooser("Choose files", "upload-any")
-                    button("Try the sample", workspace.load_sample, "sample", "primary")
+                    button("Try the sample", self.workspace.load_sample, "sample", "primary")
             with region("div", "photo-area") as self.area:
                 self.strip = region(
                     "div", "strip", role="group", aria_label="photographs", data_testid="strip"

@@ -1,6 +1,7 @@
 """Plain HTML elements of the page: text, buttons, choosers of files, and parts that fold away; and
 what the parts of the page have in common."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any
@@ -11,13 +12,18 @@ from ..utils.choices import IMAGES, MESHES_AND_BANKS
 from .workspace import CALIBRATIONS, Workspace
 
 
-class Panel:
+class Panel(ABC):
     """A part of the page, which shows what changed in a workspace."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
         self.session = workspace.session
         self.shown: dict[str, Any] = {}  # what the page shows, to draw only what has changed
+        self.lay_out()
+
+    @abstractmethod
+    def lay_out(self) -> None:
+        """Add the elements to the page."""
 
     def changed(self, name: str, value: Any) -> bool:
         """Whether something differs from what the page shows, which it does not afterwards."""
