@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from statistics import fmean, median_low
 from typing import Any, TypeAlias
 
 import torch
@@ -86,16 +87,16 @@ class Expected:
 
     @classmethod
     def of(cls, outcomes: Sequence[Outcome]) -> "Expected":
-        errors = torch.tensor([outcome.error_deg for outcome in outcomes], dtype=torch.float64)
-        reliable = torch.tensor([outcome.is_reliable for outcome in outcomes])
-        right = errors <= RIGHT_DEGREES
+        errors = [outcome.error_deg for outcome in outcomes]
         return cls(
             n=len(outcomes),
-            right=float(right.double().mean()),
-            within_5_deg=float((errors <= FINE_DEGREES).double().mean()),
-            reliable=float(reliable.double().mean()),
-            reliable_and_wrong=float((reliable & ~right).double().mean()),
-            median_deg=float(errors.median()),
+            right=fmean(outcome.is_right for outcome in outcomes),
+            within_5_deg=fmean(error <= FINE_DEGREES for error in errors),
+            reliable=fmean(outcome.is_reliable for outcome in outcomes),
+            reliable_and_wrong=fmean(
+                outcome.is_reliable and not outcome.is_right for outcome in outcomes
+            ),
+            median_deg=median_low(errors),
         )
 
     @property
