@@ -122,11 +122,7 @@ def _run_inspect(arguments: argparse.Namespace) -> int:
         write_file(arguments.out / "inspect.json", content.encode())
         page = report_page(report, title=arguments.mesh.name)
         write_file(arguments.out / "inspect.html", page.encode(errors="backslashreplace"))
-    print(
-        "\n".join(
-            [f"{arguments.mesh}", *report_lines(report), f"see {arguments.out / 'inspect.html'}"]
-        )
-    )
+    print(arguments.mesh, *report_lines(report), f"see {arguments.out / 'inspect.html'}", sep="\n")
     return 3 if arguments.strict and report.is_hopeless else 0
 
 

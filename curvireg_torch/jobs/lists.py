@@ -39,10 +39,9 @@ CAMERA = ("fx", "fy", "cx", "cy")
 _REQUIRED = ("photo", *BOX)
 _KNOWN = (*_REQUIRED, *CAMERA, "camera", "mask", "mesh", *PRIOR_OPTIONS)
 
-POSE_COLUMNS = (
-    *("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33"),
-    *("tx", "ty", "tz"),
-)
+ROTATION = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
+TRANSLATION = ("tx", "ty", "tz")
+POSE_COLUMNS = ROTATION + TRANSLATION
 """Columns of a pose: the rotation row by row, and the translation."""
 
 RESULT_COLUMNS = ("verdict", "message", "confidence", "reliable", *POSE_COLUMNS, "exactness")

@@ -25,12 +25,10 @@ from ..utils.checks import check_pose
 from ..utils.files import FindFile, check_table_size, finite_numbers, found_in, read_csv, read_json
 from .documents import result_document
 from .entry import Entry
-from .lists import BOX, CAMERA, POSE_COLUMNS, given_camera, numbers_of
+from .lists import BOX, CAMERA, ROTATION, TRANSLATION, given_camera, numbers_of
 from .photograph import register_views
 from .result_files import RegisteredViews
 
-ROTATION = POSE_COLUMNS[:9]
-TRANSLATION = POSE_COLUMNS[9:]
 QUATERNION = ("qw", "qx", "qy", "qz")
 COLUMNS = (
     f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or "
@@ -99,11 +97,12 @@ def _view(
         raise InvalidInputError("expected fx fy cx cy, or camera (a calibration file)")
     R = torch.tensor(numbers, dtype=torch.float64)
     if len(numbers) == 4:
-        if abs(float(R.norm()) - 1.0) > 1e-2:
+        length = math.hypot(*numbers)
+        if abs(length - 1.0) > 1e-2:
             raise InvalidInputError(
-                f"expected qw qx qy qz of length 1, got {float(R.norm()):.3g}; check their order"
+                f"expected qw qx qy qz of length 1, got {length:.3g}; check their order"
             )
-        R = torch.from_numpy(Rotation.from_quat(R.roll(-1).numpy()).as_matrix())
+        R = torch.from_numpy(Rotation.from_quat(numbers, scalar_first=True).as_matrix())
     T = transform(R.view(3, 3), torch.tensor(t, dtype=torch.float64))
     check_pose(T, "the camera's pose")
     known = camera if isinstance(camera, Camera) else Camera(camera_matrix(*camera))
