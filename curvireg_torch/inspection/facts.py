@@ -58,7 +58,7 @@ class MeshFacts:
     """
 
     unit: str | None
-    extents: tuple[float, float, float]
+    extents: tuple[float, ...]
     diameter: float
     faces: int
     parts: int
@@ -120,6 +120,7 @@ def mesh_facts(mesh: MeshLike) -> MeshFacts:
     surface = mesh.surface
     unit = mesh.unit
     extents = np.ptp(mesh.vertices, axis=0)
+    size = float(np.linalg.norm(extents))
     points = extreme_points(mesh).numpy()
     hull = _convex_hull(points)
     hull_area = _flat_hull_area(points) if hull is None else float(hull.area)
@@ -136,7 +137,7 @@ def mesh_facts(mesh: MeshLike) -> MeshFacts:
     symmetries = measured_symmetries(mesh)
     is_coloured = mesh.has_colours
     warnings = [warning.text for warning in mesh.warnings]
-    warnings += _size_warnings(float(np.linalg.norm(extents)), unit)
+    warnings += _size_warnings(size, unit)
     if len(mesh.faces) > MANY_FACES:
         warnings.append(
             f"{len(mesh.faces):,} faces: contours use {VIEW_FACES:,}, and generated photographs "
@@ -166,7 +167,7 @@ def mesh_facts(mesh: MeshLike) -> MeshFacts:
             f"cover few pixels"
         )
     is_sphere = _is_sphere(surface)
-    is_large = unit is not None and float(np.linalg.norm(extents)) * UNITS[unit] > ROOM
+    is_large = unit is not None and size * UNITS[unit] > ROOM
     is_room = is_large and hull is not None and looks_inwards(surface, hull)
     is_wire = area_of_hull < WIRE_AREA
     if is_sphere and not is_coloured:
@@ -184,7 +185,7 @@ def mesh_facts(mesh: MeshLike) -> MeshFacts:
         )
     return MeshFacts(
         unit=unit,
-        extents=(float(extents[0]), float(extents[1]), float(extents[2])),
+        extents=tuple(extents.tolist()),
         diameter=2.0 * mesh_radius(mesh),
         faces=len(mesh.faces),
         parts=parts,
