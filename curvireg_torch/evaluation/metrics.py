@@ -227,11 +227,10 @@ def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
     return symmetries.to(like)
 
 
-def _chunks(transforms: Tensor, points: Tensor) -> list[Tensor]:
+def _chunks(transforms: Tensor, points: Tensor) -> tuple[Tensor, ...]:
     """Split (N, ...) so that at most ``_CHUNK`` points are transformed at once; at least one
     chunk."""
-    step = max(1, _CHUNK // len(points))
-    return [transforms[start : start + step] for start in range(0, max(1, len(transforms)), step)]
+    return torch.split(transforms, max(1, _CHUNK // len(points)))
 
 
 def _transform(T: Tensor, points: Tensor) -> Tensor:
