@@ -217,10 +217,7 @@ class _Setup:
         boxes = torch.stack([photograph.box for photograph in photographs])
         cameras = torch.stack([photograph.camera for photograph in photographs])
         found = self.registrar(images, boxes, cameras if self.with_camera else None, prior=prior)
-        return [
-            self.outcome(photograph, result if isinstance(result, Registration) else None)
-            for photograph, result in zip(photographs, found, strict=True)
-        ]
+        return [self.outcome(*pair) for pair in zip(photographs, found, strict=True)]
 
     def with_second(self, photograph: GeneratedPhotograph, subject: Mesh) -> Outcome:
         """The outcome of a photograph and a second one of the ``subject``, from beside it."""
@@ -235,18 +232,21 @@ class _Setup:
         images = [photograph.image, to_bytes(image)]
         boxes = torch.stack([photograph.box, box])
         cameras = torch.stack([torch.eye(4, dtype=torch.float64), move])
+        found: Registration | CurviregError
         try:
             found = self.registrar.register_views(images, boxes, K, cameras)
-        except CurviregError:
-            return self.outcome(photograph, None)
+        except CurviregError as error:
+            found = error
         return self.outcome(photograph, found)
 
-    def outcome(self, photograph: GeneratedPhotograph, result: Registration | None) -> Outcome:
-        """The outcome of a registration; without a camera, rotations are compared as a camera that
-        looks at the object sees them."""
+    def outcome(self, photograph: GeneratedPhotograph, result: object) -> Outcome:
+        """The outcome of a registration, or of what stands for a failed one; without a camera,
+        rotations are compared as a camera that looks at the object sees them."""
         truth = photograph.truth[:3, :3]
-        elevation = float(_viewpoint_of(self.mesh, truth)[1])
-        if result is None:
+        # from the mesh's axes, z up
+        viewpoint = viewpoint_from_rotation(truth @ up_rotation(self.mesh.up).double().mT)
+        elevation = float(viewpoint[1])
+        if not isinstance(result, Registration):
             return Outcome(photograph, None, 180.0, elevation)
         rotation = result.rotation
         if result.translation is None:
@@ -301,11 +301,6 @@ def _symmetries(registrar: Registrar) -> Tensor:
     given = registrar.symmetries
     transforms = look_symmetries(registrar.bank.mesh) if given is None else given
     return transforms[:, :3, :3].double()
-
-
-def _viewpoint_of(mesh: Mesh, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Azimuth, elevation and theta of rotations (..., 3, 3) from the mesh's axes, z up."""
-    return viewpoint_from_rotation(rotation @ up_rotation(mesh.up).double().mT)
 
 
 def _hint(photograph: GeneratedPhotograph) -> PosePrior:
