@@ -208,18 +208,15 @@ def in_words(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
         f"{common} objects in both; {only[0]} only in A and {only[1]} only in B do not count"
     )
     lines.append("")
-    for each in comparisons:
-        digits = _digits(each)
-        values = (
-            f"A {_value(each.a, each.a_interval, digits)}   B "
-            f"{_value(each.b, each.b_interval, digits)}"
-        )
-        difference = _value(each.difference, each.difference_interval, f"+{digits}")
+    first = [_value(each.a, each.a_interval, _digits(each)) for each in comparisons]
+    second = [_value(each.b, each.b_interval, _digits(each)) for each in comparisons]
+    for each, in_a, in_b in zip(comparisons, first, second, strict=True):
+        difference = _value(each.difference, each.difference_interval, f"+{_digits(each)}")
         signs = f"B wins {each.wins}, loses {each.losses}, p {each.p:.2g}"
-        lines.append(f"{each.score}: {values}   B - A {difference}   {signs}")
-    names = [each.score for each in comparisons]
-    header = ["run", "N", *names]
-    rows = _rows(a, b, comparisons)
+        lines.append(f"{each.score}: A {in_a}   B {in_b}   B - A {difference}   {signs}")
+    header = ["run", "N", *(each.score for each in comparisons)]
+    count = str(max(each.n for each in comparisons))
+    rows = [[Path(run.name).name, count, *values] for run, values in ((a, first), (b, second))]
     table = [header, ["---"] * len(header), *rows]
     lines += ["", "Markdown:", *(f"| {' | '.join(row)} |" for row in table)]
     lines += ["", "LaTeX:", *map(_latex, [header, *rows])]
@@ -228,14 +225,6 @@ def in_words(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
 
 def _how(run: Run) -> str:
     return f"preset {run.settings.get('preset')}, {run.settings.get('protocol')}"
-
-
-def _rows(a: Run, b: Run, comparisons: Sequence[Comparison]) -> list[list[str]]:
-    """Of each run its name, number of objects, and scores with intervals."""
-    count = str(max(each.n for each in comparisons))
-    first = [_value(each.a, each.a_interval, _digits(each)) for each in comparisons]
-    second = [_value(each.b, each.b_interval, _digits(each)) for each in comparisons]
-    return [[Path(a.name).name, count, *first], [Path(b.name).name, count, *second]]
 
 
 def _digits(comparison: Comparison) -> str:
