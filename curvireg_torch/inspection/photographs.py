@@ -107,15 +107,17 @@ class PhotographGenerator:
         # of its own: clutter changes nothing else
         others = torch.Generator().manual_seed(1_000_033 * self.seed + index)
         truth = _random_truth(mesh, generator, upright=self.upright)
+        centre = point_in_cameras(truth, mesh_centre(mesh))
+        radius = mesh_radius(mesh)
         background = procedural_background(SIZE, generator)
         if self.backgrounds:
             background = self.backgrounds[index % len(self.backgrounds)]
         if self.clutter:
-            background = _with_objects_behind(background, mesh, truth, others)
+            background = _with_objects_behind(background, centre, radius, others)
         K = trial_camera()
         image, box = synthesize_photograph(mesh, truth, K, SIZE, generator, background=background)
         if self.clutter and float(torch.rand((), generator=others)) < 0.5:
-            image = _with_object_in_front(image, box, mesh, truth, others)
+            image = _with_object_in_front(image, box, centre, radius, others)
         blur = BLUR * float(torch.rand((), generator=generator))
         if blur > SHARP:
             image = gaussian_smooth(image[None], blur)[0]
@@ -218,12 +220,10 @@ def _random_object(radius: float, generator: torch.Generator) -> trimesh.Trimesh
 
 
 def _with_objects_behind(
-    background: Tensor, mesh: Mesh, truth: Tensor, generator: torch.Generator
+    background: Tensor, centre: Tensor, radius: float, generator: torch.Generator
 ) -> Tensor:
     """The background with up to six objects beside and behind the object, as far away as its
     centre or farther."""
-    radius = mesh_radius(mesh)
-    centre = point_in_cameras(truth, mesh_centre(mesh))
     count = 1 + int(MOST_BESIDE * float(torch.rand((), generator=generator)))
     picture = background
     for _ in range(count):
@@ -237,12 +237,10 @@ def _with_objects_behind(
 
 
 def _with_object_in_front(
-    image: Tensor, box: Tensor, mesh: Mesh, truth: Tensor, generator: torch.Generator
+    image: Tensor, box: Tensor, centre: Tensor, radius: float, generator: torch.Generator
 ) -> Tensor:
     """The photograph with something before a side or corner of the object's box, of which it covers
     less than a third."""
-    radius = mesh_radius(mesh)
-    centre = point_in_cameras(truth, mesh_centre(mesh))
     depth = float(centre[2]) - 1.5 * radius
     if depth < radius:
         return image

@@ -161,7 +161,10 @@ def run_trial(
         report: called with "photographs", done and in all, by one thread at a time, after "bank" of
             the mesh with or without a print.
     """
-    setup = _Setup(registrar, with_camera, _symmetries(registrar))
+    symmetries = registrar.symmetries
+    if symmetries is None:  # what cannot be seen
+        symmetries = look_symmetries(registrar.bank.mesh)
+    setup = _Setup(registrar, with_camera, symmetries[:, :3, :3].double())
     conditions = _conditions(setup, generate, report) if compare else {}
     part = max(1, round(COMPARED_FRACTION * count))
     total = count + part * sum(1 if before is None else 2 for before, _ in conditions.values())
@@ -294,13 +297,6 @@ def _conditions(setup: _Setup, generate: PhotographGenerator, report: Progress) 
 
     name = "with a print, also in the mesh: orientations that look alike without count as wrong"
     return {**conditions, name: (shown(by_shape), shown(by_print))}
-
-
-def _symmetries(registrar: Registrar) -> Tensor:
-    """(S, 3, 3) rotations that do not count as errors: what was given, or cannot be seen."""
-    given = registrar.symmetries
-    transforms = look_symmetries(registrar.bank.mesh) if given is None else given
-    return transforms[:, :3, :3].double()
 
 
 def _hint(photograph: GeneratedPhotograph) -> PosePrior:
