@@ -169,12 +169,11 @@ CONFLICTS = {
 def given_options(arguments: argparse.Namespace) -> set[str]:
     """The names of the options that are given, and what follows from them: ``limits`` of the pose
     beside ``front``, and ``gpu``."""
-    options = dict(vars(arguments))
-    for name in ("jobs", "every"):
-        if options.get(name) == 1:
-            del options[name]
-    given = {name for name, value in options.items() if value not in (None, [])}
-    given -= {name for name in given if options[name] is False}
+    options = vars(arguments)
+    given = {
+        name for name, value in options.items() if value not in (None, []) and value is not False
+    }
+    given -= {name for name in ("jobs", "every") if options.get(name) == 1}
     if not given.isdisjoint(PRIOR_OPTIONS.keys() - {"front"}):
         given.add("limits")
     if options.get("device") not in (None, "cpu"):

@@ -47,7 +47,8 @@ def register_one(options: RegisterOptions, arguments: argparse.Namespace) -> Doc
             raise
     if out is not None:
         found.write(out)
-    _write_pose(arguments, found.document, found.registrar.of_mesh(found.mesh_index))
+    of_mesh = found.registrar.of_mesh(found.mesh_index)
+    _write_pose(arguments, found.document, of_mesh)
     for warning in found.warnings:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     remarks = [*photograph.facts["picture"]["notes"], *camera_in_words(found.document)]
@@ -57,7 +58,7 @@ def register_one(options: RegisterOptions, arguments: argparse.Namespace) -> Doc
             "photograph"
         )
     if not found.reliable and options.pose == "upright" and options.up is None:
-        axis = found.registrar.of_mesh(found.mesh_index).bank.mesh.up
+        axis = of_mesh.bank.mesh.up
         remarks.append(f"--pose upright: {axis} of the mesh is taken as up; --up names another")
     if remarks:  # with --json, standard output holds only the result
         print(f"{path}: {'; '.join(remarks)}", file=sys.stderr if arguments.json else sys.stdout)

@@ -76,15 +76,15 @@ def _entry(
         meshes = (find(values["mesh"]),) if values.get("mesh") else options.meshes
         if not meshes:
             raise InvalidInputError("mesh: empty, and no MESH was given; name one")
+        photo = find(values["photo"])
         numbers = numbers_of(values, BOX)
-        box = None if numbers is None else options.box_of(find(values["photo"]), numbers)
+        box = None if numbers is None else options.box_of(photo, numbers)
         camera = given_camera(values, find, calibrations) or options.camera
         mask = find(values["mask"]) if values.get("mask") else None
         own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
         prior = prior_from_limits({**options.limits, **own})
     except CurviregError as error:
         return Entry(shown, values["photo"], error=str(error))
-    photo = find(values["photo"])
     return Entry(shown, values["photo"], photo, meshes, box, camera, mask, options.instances, prior)
 
 
