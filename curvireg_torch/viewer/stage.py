@@ -373,11 +373,12 @@ class Stage(Panel):
                 self.canvas.props(f'data-answer="{time.monotonic()}"')
 
     def _show_layers(self, layers: tuple[bytes, bytes, np.ndarray]) -> None:
-        self.mask = layers[2]
-        for element, name, content in zip(
-            (self.solid, self.lines), ("solid", "lines"), layers[:2], strict=True
+        solid, lines, self.mask = layers
+        for element, name, content in (
+            (self.solid, "solid.png", solid),
+            (self.lines, "lines.png", lines),
         ):
-            element.props(f'src="{self.workspace.serve(f"{name}.png", content, "image/png")}"')
+            element.props(f'src="{self.workspace.serve(name, content, "image/png")}"')
 
     def _draw_shapes(self) -> None:
         """Draw the box, with handles where it can be changed."""
