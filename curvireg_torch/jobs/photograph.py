@@ -216,29 +216,29 @@ def register_entries(
     ``results.jsonl``; its seconds are those of the photograph and its share of those of the call.
     """
     start = time.perf_counter()
-    located = [
-        place
-        for place, (entry, item) in enumerate(entries)
-        if entry.start is None and not entry.views and item.has_box
-    ]
-    items = [entries[place][1] for place in located]
-    results: dict[int, Results] = {
-        place: [result]
-        for place, result in zip(located, registrar.register_prepared(items), strict=True)
-    }
+    located = [item for entry, item in entries if _is_located(entry, item)]
+    together = iter(registrar.register_prepared(located))
     seconds = (time.perf_counter() - start) / max(len(located), 1)
     found: list[RegisteredPhotograph | CurviregError] = []
     for place, (entry, item) in enumerate(entries):
         start = time.perf_counter()
         try:
-            known = results.get(place)
-            answers = _results_of(entry, item, registrar) if known is None else known
-            taken = time.perf_counter() - start if known is None else seconds
+            if _is_located(entry, item):
+                answers: Results = [next(together)]
+                taken = seconds
+            else:
+                answers = _results_of(entry, item, registrar)
+                taken = time.perf_counter() - start
             spent = {"bank": 0.0 if place else bank_seconds, "register": taken}
             found.append(_registered(entry, item, registrar, answers, spent))
         except CurviregError as error:
             found.append(error)
     return found
+
+
+def _is_located(entry: Entry, item: Photograph) -> bool:
+    """Whether the object is searched for in one photograph, in a box."""
+    return entry.start is None and not entry.views and item.has_box
 
 
 def _results_of(entry: Entry, item: Photograph, registrar: Registrar) -> Results:

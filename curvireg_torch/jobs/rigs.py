@@ -255,7 +255,7 @@ def register_rig(
     document = result_document(
         result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}
     )
-    document |= {"inputs": {"rig": str(path), "box": None}}
+    document["inputs"] = {"rig": str(path), "box": None}
     for row, view, item in zip(document["photographs"], rig, photographs, strict=True):
         camera, T = view.in_world
         if isinstance(item, Photograph):
