@@ -56,12 +56,11 @@ its box in px."""
 def _entry(
     cells: Sequence[str],
     columns: Mapping[str, str],
-    folder: Path,
+    find: FindFile,
     options: RegisterOptions,
     calibrations: Calibrations,
 ) -> Entry:
     """The entry of a row; ``columns`` are the names in the file, by the plain ones."""
-    find = found_in(folder)
     cells = _without_empty_end(cells, len(columns))
     count = len(columns)
     shown = dict(zip(columns.values(), cells + [""] * count, strict=False))
@@ -81,8 +80,7 @@ def _entry(
         box = None if numbers is None else options.box_of(photo, numbers)
         camera = given_camera(values, find, calibrations) or options.camera
         mask = find(values["mask"]) if values.get("mask") else None
-        own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
-        prior = prior_from_limits({**options.limits, **own})
+        prior = prior_from_limits({**options.limits, **limits_from_cells(values)})
     except CurviregError as error:
         return Entry(shown, values["photo"], error=str(error))
     return Entry(shown, values["photo"], photo, meshes, box, camera, mask, options.instances, prior)
@@ -214,8 +212,9 @@ def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
     if not rows:
         raise InvalidInputError(f"{path}: no photographs; give one row for each")
     columns = dict(zip(names, header, strict=True))
+    find = found_in(path.parent)
     calibrations = Calibrations()
-    return [_entry(cells, columns, path.parent, options, calibrations) for cells in rows]
+    return [_entry(cells, columns, find, options, calibrations) for cells in rows]
 
 
 def _without_empty_end(cells: Sequence[str], least: int) -> list[str]:

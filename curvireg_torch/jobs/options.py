@@ -367,13 +367,15 @@ def limits_from_options(options: Document) -> Fields:
 
 
 def limits_from_cells(cells: Mapping[str, str]) -> Fields:
-    """:func:`limits_from_options` of texts such as "300 60"; empty ones are not given."""
+    """:func:`limits_from_options` of the cells of a row, such as "300 60"; empty ones are not
+    given."""
     values = {}
-    for name, text in cells.items():
-        try:
-            values[name] = PRIOR_OPTIONS[name].get("type", str)(text) if text else None
-        except argparse.ArgumentTypeError as error:
-            raise InvalidInputError(f"{name}: {error}") from None
+    for name, option in PRIOR_OPTIONS.items():
+        if text := cells.get(name):
+            try:
+                values[name] = option.get("type", str)(text)
+            except argparse.ArgumentTypeError as error:
+                raise InvalidInputError(f"{name}: {error}") from None
     return limits_from_options(values)
 
 
