@@ -26,8 +26,8 @@ MAX_GLB_FACES = 300_000
 
 @dataclass(frozen=True)
 class RegisteredViews:
-    """One pose in several photographs, of which errors are those that cannot be used, that can be
-    drawn and saved; ``document`` is the content of ``result.json``."""
+    """One pose in several photographs, to be drawn and saved. In the place of a photograph that
+    cannot be used stands its error; ``document`` is the content of ``result.json``."""
 
     registrar: Registrar
     registration: Registration
