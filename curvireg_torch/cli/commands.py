@@ -1,7 +1,6 @@
 """The commands of the command line but for ``register`` and ``follow``."""
 
 import argparse
-import json
 import time
 from dataclasses import asdict, replace
 from io import BytesIO
@@ -118,8 +117,7 @@ def _run_inspect(arguments: argparse.Namespace) -> int:
                 clutter=arguments.clutter,
                 progress=show,
             )
-        content = json.dumps(report.to_dict(), indent=2) + "\n"
-        write_file(arguments.out / "inspect.json", content.encode())
+        write_file(arguments.out / "inspect.json", to_json(report.to_dict()).encode())
         page = report_page(report, title=arguments.mesh.name)
         write_file(arguments.out / "inspect.html", page.encode(errors="backslashreplace"))
     print(arguments.mesh, *report_lines(report), f"see {arguments.out / 'inspect.html'}", sep="\n")
