@@ -292,7 +292,7 @@ def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Co
             reason = message if entry.name in message else f"{entry.name}: {message}"
             failures.append(f"row {number}: {reason}".encode(errors="backslashreplace").decode())
         for instance, found in enumerate(objects, start=1):
-            # the list's own cells count where its columns have names of columns that are left out
+            # A list may have columns such as "instance" of its own where no objects are numbered.
             cells = {BEST_MESH: row.get("mesh"), **_result_cells(instance, found), **entry.cells}
             lines.append([cells.get(column) for column in columns])
     counts = Counts(Counter(shot.kind for shot in shown), tuple(failures))

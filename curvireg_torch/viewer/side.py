@@ -359,11 +359,14 @@ class CameraPanel(Panel):
         if shot.view is not None:
             words = "of each photograph, from the rig"
             return f"{words}, without its distortion" if shot.is_undistorted else words
-        if camera == "exif" and shot.photo is not None:
+        if camera == "exif":
+            words = "from the photograph's EXIF"
+            if shot.photo is None:
+                return words
             focal = shot.photo.focal_35mm
-            words = f"{focal:g} mm of a 35 mm camera" if focal else "has no focal length"
-            return f"from the photograph's EXIF, {words}"
-        if isinstance(camera, str | float):
+            length = f"{focal:g} mm of a 35 mm camera" if focal else "has no focal length"
+            return f"{words}, {length}"
+        if isinstance(camera, float):
             return "from the field of view, to about 10 %"
         if isinstance(camera, Camera):
             words = "from a calibration file"

@@ -16,6 +16,7 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import Camera
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.viewer.page import Steps, build_page
+from curvireg_torch.viewer.shot import Shot
 from curvireg_torch.viewer.side import Answers, CameraPanel, Inputs, Preview
 from curvireg_torch.viewer.stage import Stage
 from curvireg_torch.viewer.workspace import Workspace
@@ -123,6 +124,10 @@ def test_typed_numbers_go_into_the_session(workspace, build):
     refresh()
     assert panel.facts.content == "from a calibration file, without its distortion"
     assert inputs.command.content.startswith("None: ")
+    asyncio.run(panel._set_camera("exif"))
+    session.shot = Shot()
+    refresh()
+    assert panel.facts.content.endswith("s EXIF"), "of one that is still to come"
 
 
 def test_what_is_typed_before_the_button_is_pressed_is_what_the_search_uses(
