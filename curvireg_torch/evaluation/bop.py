@@ -86,7 +86,8 @@ class BOPBenchmark(Benchmark):
         return tuple(self._other_view(first, others[k]) for k in order)
 
     def _other_view(self, first: int, other: int) -> Entry:
-        entry, (one, two) = self.entries[other], (self.samples[i] for i in (first, other))
+        entry = self.entries[other]
+        one, two = (self.samples[i] for i in (first, other))
         T_one = one["T_cam_from_world"].double()
         T_two = two["T_cam_from_world"].double()
         # the object stands still: it is the world

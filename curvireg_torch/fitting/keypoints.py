@@ -306,7 +306,8 @@ def _pose(
         return None
     count = _places(uv[inliers[:, 0]], error)
     T = torch.eye(4, dtype=torch.float64)
-    T[:3, :3], T[:3, 3] = torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])
+    T[:3, :3] = torch.from_numpy(cv2.Rodrigues(turn)[0])
+    T[:3, 3] = torch.from_numpy(shift[:, 0])
     if count < least or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
         return None
     return nearest_rigid(T[None])[0], count

@@ -105,7 +105,8 @@ class Camera:
     def at(self, size: Size) -> "Camera":
         """Return the camera of the same photographs, resized to (H, W); another aspect ratio is
         refused."""
-        (h, w), (H, W) = self.size or size, size
+        h, w = self.size or size
+        H, W = size
         # sides of resized pictures are rounded
         if abs(w * H / h - W) > 1 and abs(h * W / w - H) > 1:
             turned = abs(h * H / w - W) <= 1
@@ -207,7 +208,9 @@ def _maps(
 ) -> tuple[tuple[Any, Any], Tensor]:
     """Maps of ``cv2.remap`` from a photograph of (H, W) to one without distortion, and (H, W) bool:
     what is missing."""
-    (H, W), K, D = size, np.array(matrix).reshape(3, 3), np.array(distortion)
+    H, W = size
+    K = np.array(matrix).reshape(3, 3)
+    D = np.array(distortion)
     library = cv2.fisheye if model == "fisheye" else cv2
     x, y = library.initUndistortRectifyMap(K, D, np.eye(3), K, (W, H), cv2.CV_32FC1)
     u = (np.arange(W) - K[0, 2]) / K[0, 0]
@@ -258,7 +261,9 @@ def _with_radii(points: Array, old: Array, new: Array) -> Array:
 def _undistorted_box(camera: Camera, box: Tensor, size: Size) -> Tensor:
     """(4,) around the undistorted outline of a box; what extends beyond the photograph moves with
     its border."""
-    (H, W), K, D = size, camera.matrix.numpy(), np.array(camera.distortion)
+    H, W = size
+    K = camera.matrix.numpy()
+    D = np.array(camera.distortion)
     check_boxes(box[None].detach().float(), [size])
     x0, y0, x1, y1 = box.detach().cpu().double().tolist()
     around = np.linspace(0.0, 4.0, 201)

@@ -52,7 +52,8 @@ def colours_at(
 
 def _sample(texture: Bytes, uv: Singles) -> Singles:
     """(N, 3) in [0, 1]: bilinear, repeating."""
-    (h, w), count = texture.shape[:2], len(uv)
+    h, w = texture.shape[:2]
+    count = len(uv)
     places = np.zeros((2, -(-count // ROW) * ROW), np.float32)
     places[:, :count] = (uv[:, 0] % 1.0) * w - 0.5, (-uv[:, 1] % 1.0) * h - 0.5
     x, y = places.reshape(2, -1, ROW)

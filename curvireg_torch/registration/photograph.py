@@ -363,7 +363,8 @@ def _object_mask(mask: Any, image: Tensor) -> Tensor:
             f"mask: expected bool, uint8 or floating (H, W), or a path, got {type_and_shape(mask)}"
         )
     if x.shape != image.shape[-2:]:
-        (H, W), shape = image.shape[-2:], tuple(x.shape)
+        H, W = image.shape[-2:]
+        shape = tuple(x.shape)
         raise InvalidInputError(
             f"mask: expected shape ({H}, {W}), that of the photograph, got {shape}"
         )

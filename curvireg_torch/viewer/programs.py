@@ -29,7 +29,8 @@ def python_program(shot: Shot, name: Callable[[Path], str]) -> str:
     """A Python program that gives the answer of a photograph; ``name`` tells what the user calls a
     file."""
     result = shot.require_result()
-    (request, boxes), prior = result.inputs, result.registration.prior
+    request, boxes = result.inputs
+    prior = result.registration.prior
     mesh = repr(name(request.meshes[0]))
     rows = result.document.get("photographs", [])
     photos = [repr(name(path)) for path in request.photos]

@@ -226,7 +226,9 @@ class Shot:
         """Move the answer to (4, 4) ``T_cam_from_model``, without its measurements; ``edit`` says
         how, in words."""
         result = self.require_result()
-        answer, (before, K), centre = result.answer, self.projection, result.centre(T)
+        answer = result.answer
+        before, K = self.projection
+        centre = result.centre(T)
         degrees = float(rotation_error(T[:3, :3], before[:3, :3]))
         radii = (
             float(torch.linalg.vector_norm(centre - result.centre(before)))
@@ -253,7 +255,8 @@ class Shot:
 
     def fit(self) -> None:
         """Fit the contours at the answer to the photograph's edges."""
-        registrar, (T, K) = self.require_result().registrar, self.projection
+        registrar = self.require_result().registrar
+        T, K = self.projection
         contours = registrar.describer.contours
         margin = registrar.bank.settings.margin
         fit = fit_contours(contours, self.image, self.require_box(), K, T[None], margin=margin)
@@ -298,7 +301,8 @@ def numbers(box: BoxLike) -> Numbers:
 def dragged_box(box: Numbers | None, start: Point, end: Point, *, reach: float) -> Numbers | None:
     """The box in px after a drag: of an edge or corner within ``reach`` px, of all of it from
     inside, or a new one."""
-    at, to = np.array(start), np.array(end)
+    at = np.array(start)
+    to = np.array(end)
     edges = np.array(box or (np.inf, np.inf, -np.inf, -np.inf)).reshape(2, 2)
     if (edges[0] - reach <= at).all() and (at <= edges[1] + reach).all():
         # inside, at most a third of the box is near to an edge

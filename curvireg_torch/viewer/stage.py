@@ -186,7 +186,8 @@ class Stage(Panel):
             shot.set_box(None)
 
     def _change_pose(self, what: Any, point: Point, reach: float) -> None:
-        result, (T, K) = self.session.shot.require_result(), self.session.shot.projection
+        result = self.session.shot.require_result()
+        T, K = self.session.shot.projection
         kind = what["type"]
         T = T if self.moved is None else self.moved
         self._last_gesture = time.monotonic()
@@ -214,7 +215,8 @@ class Stage(Panel):
     def _on_mesh(self, x: float, y: float, reach: float) -> bool:
         """Whether the mesh is drawn at a pixel, or within ``reach`` of it, in widths of the
         photograph."""
-        (rows, columns), (H, W) = self.mask.shape, self.session.shot.size
+        rows, columns = self.mask.shape
+        H, W = self.session.shot.size
         row = int((y + 0.5) / H * rows)
         column = int((x + 0.5) / W * columns)
         around = round(reach * columns)

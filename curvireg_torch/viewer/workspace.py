@@ -358,7 +358,8 @@ class Workspace:
         it."""
         if self._before_sample is not None:
             self.session.close()
-            self.session.options, self._before_sample = self._before_sample, None
+            self.session.options = self._before_sample
+            self._before_sample = None
 
     def load(self) -> None:
         """Open the files that the options name; their warnings become messages."""

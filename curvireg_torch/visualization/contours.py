@@ -54,7 +54,8 @@ def _line_width(size: Sequence[int]) -> float:
 def close_up(size: Sequence[int], box: Sequence[float]) -> tuple[int, int, int, int]:
     """A square window around a box in px with a margin, moved into a photograph of ``size`` (H, W)
     and cut there."""
-    (H, W), (x0, y0, x1, y1) = size, box
+    H, W = size
+    x0, y0, x1, y1 = box
     side = round(1.3 * max(x1 - x0, y1 - y0)) + 2
     left = max(0, min(round(0.5 * (x0 + x1 - side)), W - side))
     top = max(0, min(round(0.5 * (y0 + y1 - side)), H - side))

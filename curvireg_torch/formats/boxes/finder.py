@@ -308,7 +308,8 @@ def _fitted(corners: Corners, size: Size, picture: PictureSize) -> Corners:
 
 def _has_proportions(size: Size, other: Size) -> bool:
     """Whether two pictures differ in scale alone; sides are rounded."""
-    (h, w), (H, W) = size, other
+    h, w = size
+    H, W = other
     return abs(w * H / h - W) <= 1 or abs(h * W / w - H) <= 1
 
 
