@@ -3,6 +3,7 @@
 
 import argparse
 import re
+import sys
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import fields
 from pathlib import Path
@@ -35,16 +36,18 @@ TRACKERS = ("m3t", "visp")  # formats of a start pose that take the mesh too
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that takes no abbreviations."""
+    """A parser that takes no abbreviations, and whose help and version do not get lost."""
 
     def __init__(self, **how: Any) -> None:
         super().__init__(
             allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **how
         )
 
-    def print_help(self, file: Any = None) -> None:
-        """Print the help; argparse itself says nothing if it cannot be written."""
-        print(self.format_help(), end="", file=file)
+    def _print_message(self, message: str, file: Any = None) -> None:
+        # argparse itself says nothing if a message cannot be written
+        file = file or sys.stderr
+        if message and file is not None:
+            file.write(message)
 
 
 def add_command(commands: Any, name: str, *examples: str, **how: Any) -> Any:

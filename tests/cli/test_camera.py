@@ -125,9 +125,9 @@ def lens(folder):
 def test_a_photograph_is_decoded_and_undistorted_once_for_all_meshes(
     folder, lens, register, monkeypatch
 ):
-    decode = Mock(wraps=images.decoded)
+    decode = Mock(wraps=images.opened_picture)
     remap = Mock(wraps=cv2.remap)
-    monkeypatch.setattr(images, "decoded", decode)
+    monkeypatch.setattr(images, "opened_picture", decode)
     monkeypatch.setattr(cv2, "remap", remap)
     words = ["--mesh", folder / "truck.safetensors"] * 2
     words += ["--box", *lens[0], "--camera", folder / "cam.json"]
