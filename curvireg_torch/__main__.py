@@ -10,7 +10,21 @@ if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     # while modules are imported, Ctrl-C ends the process without a trace
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-from .cli import main as run
+_codes: list[int] = []
+
+
+@atexit.register  # before other modules: the first that is registered is called last
+def _end() -> None:
+    """End the process with the code of its command, if that has returned one: Python would take
+    2,000 modules apart before, and torch its libraries, which takes 0.2 s."""
+    if _codes:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:  # it may have been closed from the beginning
+                stream.flush()
+        os._exit(_codes[0])
+
+
+from .cli import main as run  # noqa: E402
 
 
 def main() -> int:
@@ -24,20 +38,8 @@ def main() -> int:
 
 def start() -> int:
     """Run one command as the only work of this process."""
-    codes: list[int] = []
-    atexit.register(_end, codes)  # the first that is registered is called last
-    codes.append(main())
-    return codes[0]
-
-
-def _end(codes: list[int]) -> None:
-    """End the process with the code of its command, if that has returned one: Python would take
-    2,000 modules apart before, and torch its libraries, which takes 0.2 s."""
-    if codes:
-        for stream in (sys.stdout, sys.stderr):
-            if stream is not None:  # it may have been closed from the beginning
-                stream.flush()
-        os._exit(codes[0])
+    _codes.append(main())
+    return _codes[0]
 
 
 if __name__ == "__main__":

@@ -61,7 +61,14 @@ sys.exit(__main__.start())
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
     )
+    assert done.stderr == ""
     return done.returncode, done.stdout.split("\n")[:-1]
+
+
+def test_a_process_releases_what_it_shares_with_others():
+    """Such as the lock of progress bars, of which Python warns otherwise."""
+    lock = "global lock; import multiprocessing; lock = multiprocessing.get_context('spawn').Lock()"
+    assert end_of(f"{lock}; return 0") == (0, ["written", "released"])
 
 
 def test_a_process_ends_after_what_its_command_registered_and_is_not_taken_apart():
