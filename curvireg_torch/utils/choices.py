@@ -21,7 +21,7 @@ def unit_of_length(metres: float) -> str | None:
     """The unit that has so many metres, of those of ``UNITS``.
 
     Example:
-        >>> unit_of_length(0.0254), unit_of_length(0.5)
+        >>> unit_of_length(0.0254), unit_of_length(0.025)
         ('in', None)
     """
     lengths = UNITS.items()
