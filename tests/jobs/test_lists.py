@@ -235,8 +235,9 @@ def test_the_page_of_a_list_begins_with_the_surest_answers(tmp_path, monkeypatch
     }
     shown = []
     monkeypatch.setattr(lists, "write_sheet", lambda _, __, entries, **___: shown.extend(entries))
-    entries = [Entry({"photo": name}, name, label=name) for name in rows]
+    entries = [Entry({"photo": name, "instance": "7"}, name, label=name) for name in rows]
     lists._write_tables(entries, tmp_path, Mock(read=rows.get))
+    assert {row["instance"] for row in table(tmp_path)} == {"7"}, "a column of the list itself"
     in_order = [one.name for one in sorted(shown, key=lambda one: one.rank)]
     assert in_order == ["surer", "sure", "likely", "unlikely", "failed"]
 
