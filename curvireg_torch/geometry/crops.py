@@ -70,6 +70,20 @@ def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
     return overlap / torch.where(union > 0, union, torch.ones_like(union))
 
 
+def box_share(box: Tensor, other: Tensor) -> float:
+    """Share, in [0, 1], of the smaller of two boxes (4,), which are not empty, that lies in the
+    other one: 1 where one contains the other.
+
+    Example:
+        >>> whole, part = torch.tensor([[0.0, 0.0, 4.0, 4.0], [3.0, 0.0, 5.0, 2.0]])
+        >>> box_share(whole, part)
+        0.5
+    """
+    common = torch.minimum(box[2:], other[2:]) - torch.maximum(box[:2], other[:2])
+    smaller = min((each[2:] - each[:2]).prod() for each in (box, other))
+    return float(common.clamp(min=0).prod() / smaller)
+
+
 def non_maximum_suppression(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
     """Indices of (N, 4) boxes by falling score (N,), without those that overlap a better one by
     more than an IoU."""

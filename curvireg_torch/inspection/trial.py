@@ -22,7 +22,7 @@ from ..geometry.viewpoint import up_rotation
 from ..matching import cached_bank
 from ..mesh import Mesh, mesh_centre
 from ..registration import Registrar, Registration
-from ..registration.stages import share_of_worker
+from ..registration.block import share_of_worker
 from ..synthetic import synthesize_photograph
 from ..utils.aliases import Fields, Progress
 from ..utils.threads import available_threads, map_on_threads

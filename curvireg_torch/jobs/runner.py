@@ -24,9 +24,9 @@ from ..errors import (
 )
 from ..formats.meshes.files import mesh_digest
 from ..registration import Registrar
+from ..registration.block import share_of_worker
 from ..registration.photograph import Photograph
 from ..registration.result import verdict_of_error
-from ..registration.stages import share_of_worker
 from ..utils.executors import Workers
 from ..utils.files import file_digest, text_digest, write_file
 from ..utils.sources import package_digest

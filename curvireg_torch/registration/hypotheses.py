@@ -26,6 +26,7 @@ from .result import Hypothesis
 
 __all__ = [
     "Hypotheses",
+    "are_repeated",
     "best_views",
     "by_contours",
     "close_rivals",
@@ -277,6 +278,12 @@ def common_score(hypothesis: Hypothesis, weights: EvidenceWeights) -> float:
     evidence = hypothesis.evidence
     similarity = weights.similarity * evidence["similarity"]
     return similarity + weights.keypoints * evidence["keypoints"]
+
+
+def are_repeated(views: Tensor, photograph: Tensor) -> Tensor:
+    """(N,) bool: whether a view (N,) is among those before it of the same ``photograph`` (N,)."""
+    equal = (views == views[:, None]) & (photograph == photograph[:, None])
+    return equal.tril(diagonal=-1).any(dim=1)
 
 
 def distinct_poses(

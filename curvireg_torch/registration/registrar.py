@@ -20,12 +20,13 @@ from ..utils.choices import MESH_KINDS
 from ..utils.executors import Workers
 from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike, MeshLike
 from ..utils.precision import full_precision
+from .block import share_of_worker
 from .detection import detect_block
 from .photograph import OnDemand, Photograph, as_photographs
 from .refinement import refine
 from .result import FailedRegistration, Registration, Results
 from .several import register_views
-from .stages import Items, register_photographs, share_of_worker
+from .stages import Items, register_photographs
 from .target import Target
 
 __all__ = ["Registrar"]

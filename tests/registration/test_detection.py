@@ -20,7 +20,7 @@ from curvireg_torch.geometry import (
 )
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.matching.detector import _medoids
-from curvireg_torch.registration import Detector, Proposals, detect, stages
+from curvireg_torch.registration import Detector, Proposals, block, detect
 from curvireg_torch.registration import detection as detection_module
 from curvireg_torch.registration.detection import RegisteredBox, _add, _allowed_views
 from curvireg_torch.registration.photograph import Photograph
@@ -390,7 +390,7 @@ def test_places_of_one_object_leave_room_for_others(monkeypatch):
 @pytest.mark.slow
 def test_photographs_are_searched_together_as_alone(registrar, found, monkeypatch):
     """One that cannot be searched fails alone, and each answer is that of its own photograph."""
-    monkeypatch.setattr(stages, "BLOCK", {"cpu": 2})
+    monkeypatch.setattr(block, "BLOCK", {"cpu": 2})
     images = [found[0], pasted_scene(5, (200, 120), 0.45)[0], torch.zeros_like(found[0])]
     together = detect(registrar, images, instances=2)
     for number, image in enumerate(images):

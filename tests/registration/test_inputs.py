@@ -9,7 +9,7 @@ import torch
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.pipeline import FitSettings
-from curvireg_torch.registration import Registrar, stages
+from curvireg_torch.registration import Registrar, block
 from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration.photograph import Photograph, as_photographs, camera_warnings
 from tests._support import CAMERA, SIZE, learned_registrar, scene, truck_registrar, write_photo
@@ -88,7 +88,7 @@ def test_photographs_are_decoded_once_and_not_kept(tmp_path, monkeypatch):
         return photo
 
     monkeypatch.setattr(photograph_module, "read_photo", counted)
-    monkeypatch.setitem(stages.BLOCK, "cpu", 2)
+    monkeypatch.setitem(block.BLOCK, "cpu", 2)
     scenes = [scene(seed) for seed in range(6)]
     paths = [tmp_path / f"{seed}.png" for seed in range(6)]
     for path, (image, *_) in zip(paths, scenes, strict=True):
@@ -97,5 +97,5 @@ def test_photographs_are_decoded_once_and_not_kept(tmp_path, monkeypatch):
     results = registrar(paths, torch.stack([box for _, box, _ in scenes]), CAMERA)
     assert all(result.ok for result in results)
     assert (decoded.count(paths[0]), len(decoded)) == (1, len(paths))
-    assert most[0] <= 2 * stages.BLOCK["cpu"], "those of a block, and of the one before"
-    assert len(alive) <= stages.BLOCK["cpu"]
+    assert most[0] <= 2 * block.BLOCK["cpu"], "those of a block, and of the one before"
+    assert len(alive) <= block.BLOCK["cpu"]

@@ -322,6 +322,26 @@ def plain():
     return answer_of(truck_registrar(), IMAGE, BOX)
 
 
+@pytest.mark.parametrize(
+    ("moved", "is_beside"),
+    [
+        ((0.3, 0.0, 0.3, 0.0), False),
+        ((0.5, 0.0, 0.5, 0.0), True),
+        ((0.0, -0.5, 0.0, -0.5), True),
+        ((-0.4, -0.4, 0.4, 0.4), False),  # around it
+        ((0.4, 0.4, -0.3, -0.3), False),  # of a part
+        ((0.6, 0.0, -0.1, 0.0), False),
+        ((0.6, 0.0, 0.6, 0.0), True),
+    ],
+)
+def test_a_pose_beside_its_box_is_not_believed(monkeypatch, plain, moved, is_beside):
+    sure = replace(plain, probabilities=(1.0,))
+    box = BOX + torch.tensor(moved) * (BOX[2:] - BOX[:2]).repeat(2)
+    result, _ = registered_in_boxes(monkeypatch, *[sure] * 4, box=box)
+    assert (stages.BESIDE_BOX in result.warnings) == is_beside
+    assert result.reliable != is_beside
+
+
 def with_evidence(result, **evidence):
     best = result.hypotheses[0]
     return replace(result, hypotheses=(replace(best, evidence=best.evidence | evidence),))
