@@ -24,7 +24,7 @@ from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import DEFAULT, PRESETS, ViewPolicy
 from scripts.robustness.wrong_inputs import cases
-from tests._support import double, truck_bank
+from tests._support import double, slow_after, truck_bank
 from tests._support.small import SMALL
 from tests.viewer.test_session import write_scene
 
@@ -158,7 +158,7 @@ def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
     assert f"translation: {', '.join(f'{v:.4g}' for v in result['translation'])} m\n" in printed
 
 
-@pytest.mark.parametrize("kind", ["overlay", "fields", "viewpoints"])
+@pytest.mark.parametrize("kind", slow_after(1, ["overlay", "fields", "viewpoints"]))
 def test_plot_draws_a_registration(folder, tmp_path, monkeypatch, kind):
     monkeypatch.setenv("CURVIREG_CACHE", str(folder / "plotted"))
     box, _ = write_scene(tmp_path)

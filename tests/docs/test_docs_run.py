@@ -44,7 +44,7 @@ FIRST_PAGES = (ROOT / "README.md", DOCS / "getting-started.md")
 SLOW = {
     *("evaluation", "datasets", "several", "coming-from", "boxes", "without-a-box", "unit-and-up"),
     *("layers", "how-sure", "photographs", "several-photographs", "known-pose", "cameras"),
-    *("follow", "pose-prior", "many", "results"),
+    *("follow", "pose-prior", "many", "results", "architecture"),
 }  # the others run some seconds
 
 
