@@ -2,6 +2,7 @@ import json
 import pickle
 import re
 import shutil
+import time
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -276,10 +277,15 @@ def test_follow_keeps_the_poses_before_an_interruption(
             raise KeyboardInterrupt
         drawn.append(add(*arguments))
 
-    capture = cv2.VideoCapture
-    file = str(frames[0] / "turn.avi")
+    camera = cv2.VideoCapture(str(frames[0] / "turn.avi"))
+    first = camera.read()
+
+    def read():  # a scene at rest: live frames are dropped on a busy machine
+        time.sleep(0.01)
+        return first
+
     if source == "0":
-        monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture(file))
+        monkeypatch.setattr(cv2, "VideoCapture", lambda _: Mock(wraps=camera, read=read))
     monkeypatch.setattr(OverlayVideo, "add", interrupted)
     assert follow("--camera", *CAMERA, "--out", tmp_path, source=source, start=True) == code
     verdicts = [row["verdict"] for row in table(tmp_path)]
