@@ -155,8 +155,8 @@ def _compared_with_box(
     item: Photograph | CurviregError,
     result: Registration | FailedRegistration,
 ) -> Registration | FailedRegistration:
-    """The result in a photograph, with a warning where it is beside the given box, as another copy
-    of the object is that the box shows a part of."""
+    """The result in a photograph, with a warning where its pose lies beside the given box: perhaps
+    on another copy of the object, of which the box shows a part."""
     if not (isinstance(item, Photograph) and isinstance(result, Registration)):
         return result
     box = projected_box(meshes[result.mesh_index].describer, result.projection)
