@@ -25,6 +25,18 @@ from .protocol import Protocol, hint_of_truth, perturbed_box
 Errors = Mapping[str, Tensor]
 """Errors (N,) of results by name."""
 
+VIEWPOINT_COLUMNS = (
+    "azimuth",
+    "elevation",
+    "theta",
+    "true_azimuth",
+    "true_elevation",
+    "true_theta",
+    "error_deg",
+)
+"""Columns of tables of predictions that hold viewpoints, in degrees: found, true, and the rotation
+between them."""
+
 NO_SYMMETRIES = torch.empty(0, 3, 3, dtype=torch.float64)
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..data import Pascal3DPlus
 from ..jobs.store import Row, Rows
-from .benchmark import Benchmark, Errors, estimated_rotations, true_rotations
+from .benchmark import VIEWPOINT_COLUMNS, Benchmark, Errors, estimated_rotations, true_rotations
 from .metrics import symmetric_rotation_error
 from .protocol import random_numbers
 
@@ -60,13 +60,7 @@ class Pascal3DBenchmark(Benchmark):
         "category",
         "cad_index",
         "mesh",
-        "azimuth",
-        "elevation",
-        "theta",
-        "true_azimuth",
-        "true_elevation",
-        "true_theta",
-        "error_deg",
+        *VIEWPOINT_COLUMNS,
         "symmetric_error_deg",
         "score",
         "confidence",

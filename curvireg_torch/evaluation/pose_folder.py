@@ -2,7 +2,7 @@
 
 from ..data import PoseFolder
 from ..jobs.store import Row, Rows
-from .benchmark import Benchmark, Errors
+from .benchmark import VIEWPOINT_COLUMNS, Benchmark, Errors
 
 
 class PoseFolderBenchmark(Benchmark):
@@ -20,13 +20,7 @@ class PoseFolderBenchmark(Benchmark):
         "category",
         "object_index",
         "image_id",
-        "azimuth",
-        "elevation",
-        "theta",
-        "true_azimuth",
-        "true_elevation",
-        "true_theta",
-        "error_deg",
+        *VIEWPOINT_COLUMNS,
         "score",
         "confidence",
         "reliable",
