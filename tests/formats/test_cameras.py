@@ -10,6 +10,7 @@ from curvireg_torch.errors import MAX_CAMERA_BYTES, InvalidInputError
 from tests._support.calibrations import K, check_camera
 from tests._support.doubling import check_linear
 from tests._support.refusals import refused
+from tests._support.tables import text_table
 
 LENS = (-0.31, 0.12, 0.001, -0.002, 0.03)
 FISHEYE = (0.02, -0.01, 0.003, -0.001)
@@ -298,15 +299,15 @@ def test_scenes_of_several_cameras_need_a_choice(read):
         read({"3": {"cam_K": flat}, "12": {"cam_K": [600.0, *flat[1:]]}})
 
 
-@pytest.mark.parametrize(
-    ("source", "deviation", "expected"),
-    [
-        ("given", 0.0, "given"),
-        ("given", 0.04, "given"),
-        ("estimated", 0.35, "estimated"),
-        ("exif", 0.05, "given"),
-    ],
-)
+SOURCES = """
+given     | 0.0  | given
+given     | 0.04 | given
+estimated | 0.35 | estimated
+exif      | 0.05 | given
+"""
+
+
+@pytest.mark.parametrize(("source", "deviation", "expected"), text_table(SOURCES))
 def test_the_camera_of_a_result_is_as_uncertain_as_it_was(read, source, deviation, expected):
     own = {**OWN, "focal_deviation": deviation, "source": source}
     for content in (own, {"camera": own, "inputs": {"camera": None}}):
@@ -445,27 +446,28 @@ def test_distortion_beside_several_cameras_belongs_to_none_of_them(read):
         read({"a": {"K": MATRIX}, "b": {"K": other}, "dist": LENS}, part="a")
 
 
-@pytest.mark.parametrize(
-    ("head", "part", "end"),
-    [
-        ("K: ", "[", ""),
-        ("K: ", "[1, ", ""),
-        ("K: [", "[1], ", ""),
-        ("K: [", "1, ", ""),
-        ("K: [", "1, ", "]"),
-        ("K: ", '"', ""),
-        ("K: ", "\t", "x"),
-        ("K: ", " #", ""),
-        ("", "a:\n", ""),
-        ("K:\n", "- 1\n", ""),
-        ("", "---\n", ""),
-        ("", "\n%", ""),
-        ("", "1", " PINHOLE "),
-        ("1 PINHOLE ", "1 ", ""),
-        ("K: !", "!", ""),
-        ("<a>", "<b/>", "</a>"),
-    ],
-)
+REPEATED = r"""
+"K: "         | "["     | ""
+"K: "         | "[1, "  | ""
+"K: ["        | "[1], " | ""
+"K: ["        | "1, "   | ""
+"K: ["        | "1, "   | "]"
+"K: "         | "\""    | ""
+"K: "         | "\t"    | "x"
+"K: "         | " #"    | ""
+""            | "a:\n"  | ""
+"K:\n"        | "- 1\n" | ""
+""            | "---\n" | ""
+""            | "\n%"   | ""
+""            | "1"     | " PINHOLE "
+"1 PINHOLE "  | "1 "    | ""
+"K: !"        | "!"     | ""
+"<a>"         | "<b/>"  | "</a>"
+"""
+"""What precedes and follows the part that comes again and again."""
+
+
+@pytest.mark.parametrize(("head", "part", "end"), text_table(REPEATED))
 def test_calibrations_are_read_in_linear_time(tmp_path, write, head, part, end):
     def make(count):
         write("cam", head + part * count + end)

@@ -8,6 +8,7 @@ import pytest
 from curvireg_torch import load_camera
 from tests._support.calibrations import VGA, K, check_camera
 from tests._support.refusals import refused
+from tests._support.tables import text_table
 
 LENS = (-0.31, 0.12, 0.001, -0.002)
 FLAT = {"fx": 520.5, "fy": 522.0, "cx": 321.25, "cy": 238.5}
@@ -153,18 +154,6 @@ def test_json_of_further_tools(read, content, distortion, size):
 
 
 REFUSED = {
-    "isaac": (
-        {"cameraFocalLength": 24.0, "cameraAperture": [20.9, 11.8]},
-        "Isaac Sim; write fx = wid",
-    ),
-    "meshroom": (
-        {"intrinsics": [{"width": "640", "pxFocalLength": "520", "type": "radial3"}]},
-        "Meshroom; export them as COLMAP",
-    ),
-    "camera2": (
-        {"android.lens.intrinsicCalibration": [520.5, 522, 321, 238, 0]},
-        r"Camera2; write .* \(a, b, c, d, e\) as distortion_coefficients: \[a, b, d, e, c\]",
-    ),
     "another name": (
         {"K": MATRIX, "my_distortion": BENT},
         "'my_distortion': looks like distortion",
@@ -193,23 +182,6 @@ REFUSED = {
         {**FLAT, "coeffs": BENT, "model": "inverse_brown_conrady"},
         "'inverse_brown_conrady' is not",
     ),
-    "projection": (
-        {"K": [[520, 0, 321, 5], [0, 520, 238, 0], [0, 0, 1, 0]]},
-        "also moves the camera",
-    ),
-    "projection by column": (
-        {"K": [[520, 0, 0, 0], [0, 520, 0, 0], [321, 238, 1, 0], [5, 0, 0, 1]]},
-        "also moves the camera",
-    ),
-    "mei": (
-        {"model_type": "MEI", "projection_parameters": {"gamma1": 1.0}},
-        "'MEI' is not supported",
-    ),
-    "field of view": (
-        {"camera_angle_x": 0.7, "frames": []},
-        "no fl_x; without it, give the field of view",
-    ),
-    "no centre": ({"fl_x": 520.5, "w": 640, "h": 480}, "no cx and cy"),
     "a polynomial of nerfstudio": ({**CORNER, "k4": 0.1}, "k4 of nerfstudio"),
     "fisheye with tangential": (
         {**FLAT, **FOUR, "is_fisheye": True},
@@ -227,24 +199,25 @@ REFUSED = {
         {**REALSENSE, "coeffs": BENT, "model": 2},
         "'inversebrown' is not supported",
     ),
-    "fractions": (
-        {"K": [[0.8, 0, 0.5], [0, 1.1, 0.49], [0, 0, 1]], **SIZE},
-        "in fractions of the picture, not in px",
-    ),
-    "not calibrated": ({"k": [0.0] * 9, "d": [], **SIZE}, "a camera that is not calibrated"),
-    "no centre beside two lengths": (
-        {"fx": 520.5, "fy": 522.0},
-        "got 2 of these; add cx, cy, in px",
-    ),
-    "spherical": (
-        {"projection_type": "spherical", "focal": 0.8, **SIZE},
-        "'spherical' is not supported; choose from perspective, brown",
-    ),
-    "OpenSfM without size": ({"projection_type": "brown", "focal_x": 0.8}, "no width, height"),
 }
+FOREIGN = r"""
+{"cameraFocalLength": 24.0, "cameraAperture": [20.9, 11.8]}          | Isaac Sim; write fx = wid
+{"intrinsics": [{"width": "640", "pxFocalLength": "520", "type": "radial3"}]} | Meshroom; export them as COLMAP
+{"android.lens.intrinsicCalibration": [520.5, 522, 321, 238, 0]}     | Camera2; write .* \(a, b, c, d, e\) as distortion_coefficients: \[a, b, d, e, c\]
+{"K": [[520, 0, 321, 5], [0, 520, 238, 0], [0, 0, 1, 0]]}            | also moves the camera
+{"K": [[520, 0, 0, 0], [0, 520, 0, 0], [321, 238, 1, 0], [5, 0, 0, 1]]} | also moves the camera
+{"model_type": "MEI", "projection_parameters": {"gamma1": 1.0}}      | 'MEI' is not supported
+{"camera_angle_x": 0.7, "frames": []}                                | no fl_x; without it, give the field of view
+{"fl_x": 520.5, "w": 640, "h": 480}                                  | no cx and cy
+{"K": [[0.8, 0, 0.5], [0, 1.1, 0.49], [0, 0, 1]], "width": 640, "height": 480} | in fractions of the picture, not in px
+{"k": [0, 0, 0, 0, 0, 0, 0, 0, 0], "d": [], "width": 640, "height": 480} | a camera that is not calibrated
+{"fx": 520.5, "fy": 522.0}                                           | got 2 of these; add cx, cy, in px
+{"projection_type": "spherical", "focal": 0.8, "width": 640, "height": 480} | 'spherical' is not supported; choose from perspective, brown
+{"projection_type": "brown", "focal_x": 0.8}                         | no width, height
+"""  # noqa: E501
 
 
-@pytest.mark.parametrize(("content", "words"), REFUSED.values(), ids=REFUSED)
+@pytest.mark.parametrize(("content", "words"), [*REFUSED.values(), *text_table(FOREIGN)])
 def test_what_cannot_be_read_is_named(read, content, words):
     """No distortion is dropped in silence."""
     with refused(words):

@@ -89,11 +89,9 @@ def test_bop_writes_millimetres_and_several_objects(read):
     truth = {"3": [entry(1, other), entry(5, R)], "12": [entry(5, other), entry(5, R)]}
     check(read(truth, "000003", mesh="obj_000005"), "mm")
     check(read(truth, "12:1"), "mm")
-    words = "poses of several images; choose one as FILE:IMAGE_ID from 3, 12"
-    with refused(words):
+    with refused("poses of several images; choose one as FILE:IMAGE_ID from 3, 12"):
         read(truth)
-    words = "expected one pose, got 2 of 2"
-    with refused(words):
+    with refused("expected one pose, got 2 of 2"):
         read(truth, "12", mesh="obj_000005")
     check(read({"7": [entry(1, R)]}), "mm")
     check(read(entry(1, R)), "mm")
@@ -104,8 +102,7 @@ def test_ros_writes_metres(read):
     pose = {"position": dict(zip("xyz", t.tolist(), strict=True)), "orientation": q}
     check(read({"header": {"frame_id": "camera"}, "pose": pose}), "m")
     check(read({"header": {}, "pose": {"pose": pose, "covariance": [0.0] * 36}}), "m")
-    words = "expected position and orientation"
-    with refused(words):
+    with refused("expected position and orientation"):
         read({"header": {}, "pose": [1]})
 
 

@@ -1,4 +1,4 @@
-"""3MF files, which are zip archives."""
+"""3MF files, which are zip archives, and URDF files."""
 
 import zipfile
 
@@ -9,15 +9,19 @@ SMALL = trimesh.creation.box((3.0, 2.0, 1.0))
 ITEM = '<item objectid="1"/>'
 
 
-def threemf(path, resources, items=ITEM, *, unit='unit="inch"', more=None):
+def model(resources, items=ITEM, unit='unit="inch"'):
+    """The text of a model in a 3MF file."""
     namespace = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
     text = (
         f'<?xml version="1.0"?><model {unit} xmlns="{namespace}" xmlns:m="materials" '
         f'xmlns:p="production">'
     )
-    text += f"<resources>{resources}</resources><build>{items}</build></model>"
+    return f"{text}<resources>{resources}</resources><build>{items}</build></model>"
+
+
+def threemf(path, *content, more=None, **how):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("3D/3dmodel.model", text)
+        archive.writestr("3D/3dmodel.model", model(*content, **how))
         for name, content in (more or {}).items():
             archive.writestr(name, content)
     return path
@@ -31,3 +35,14 @@ def solid(number, attributes="", triangle=""):
     )
     mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
     return f'<object id="{number}" type="model" {attributes}>{mesh}</object>'
+
+
+def robot(path, *visuals, more=""):
+    """Write a URDF file of one link that shows these."""
+    shapes = "".join(f"<visual>{one}</visual>" for one in visuals)
+    path.write_text(f'<robot name="r">{more}<link name="tip">{shapes}</link></robot>')
+    return path
+
+
+def mesh_of_robot(name, more=""):
+    return f'<geometry><mesh filename="{name}" {more}/></geometry>'

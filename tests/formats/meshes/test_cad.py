@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import zipfile
 
 import numpy as np
 import pytest
@@ -16,7 +15,17 @@ from curvireg_torch.utils import extras, programs
 from curvireg_torch.utils.extras import is_installed
 from tests._support.quick import slow_after
 from tests._support.refusals import refused
-from tests.formats.meshes.packages import BOX, ITEM, SMALL, solid, threemf
+from tests._support.tables import text_table
+from tests.formats.meshes.packages import (
+    BOX,
+    ITEM,
+    SMALL,
+    mesh_of_robot,
+    model,
+    robot,
+    solid,
+    threemf,
+)
 from tests.formats.meshes.pictures import encoded, noise
 from tests.formats.meshes.step import iges_file, step_file
 
@@ -110,21 +119,18 @@ def test_the_extra_is_loaded_only_when_needed(tmp_path):
     assert done.stdout.strip() == "False"
 
 
-@pytest.mark.parametrize(
-    ("parameters", "unit"),
-    [
-        (
-            "1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,4Hpart,1.,2,2HMM,1,0.01,15H20260101.000000,",
-            "mm",
-        ),
-        ("1H,,1H;,4Hpart,8Hpa,t.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,1,4HINCH,1,0.01,", "in"),
-        (",,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,6,1HM,1,", "m"),
-        ("1H/,1H;,4Hpart/8Hpart.igs/3Hcad/3H1.0/32/38/6/308/15//1./10/2HCM/", "cm"),
-        ("1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,9,2HUM,", None),
-        ("", None),
-        ("9999H", None),
-    ],
-)
+IGES = """
+1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,4Hpart,1.,2,2HMM,1,0.01,15H20260101.000000, | mm
+1H,,1H;,4Hpart,8Hpa,t.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,1,4HINCH,1,0.01,                        | in
+,,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,6,1HM,1,                                      | m
+1H/,1H;,4Hpart/8Hpart.igs/3Hcad/3H1.0/32/38/6/308/15//1./10/2HCM/                                | cm
+1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,9,2HUM,                                 | null
+                                                                                                 | null
+9999H                                                                                            | null
+"""  # noqa: E501
+
+
+@pytest.mark.parametrize(("parameters", "unit"), text_table(IGES))
 def test_the_unit_of_an_iges_file(parameters, unit):
     lines = [f"{'part':<72}S      1", *_records(parameters)]
     assert cad.iges_unit("\n".join(lines).encode()) == unit
@@ -175,16 +181,16 @@ def collada(asset="", image="label.png", nodes="", more=""):
     return COLLADA.format(asset=asset, image=image, nodes=nodes, more=more)
 
 
+ASSETS = """
+<unit name="inch" meter="0.0254"/><up_axis>Z_UP</up_axis> | in | z | 1.0
+<unit meter="0.001"/>                                     | mm | y | 1.0
+<unit meter="0.05"/><up_axis>X_UP</up_axis>               | m  | x | 0.05
+                                                          | m  | y | 1.0
+"""
+
+
 @needs("collada")
-@pytest.mark.parametrize(
-    ("asset", "unit", "up", "scale"),
-    [
-        ('<unit name="inch" meter="0.0254"/><up_axis>Z_UP</up_axis>', "in", "z", 1.0),
-        ('<unit meter="0.001"/>', "mm", "y", 1.0),
-        ('<unit meter="0.05"/><up_axis>X_UP</up_axis>', "m", "x", 0.05),
-        ("", "m", "y", 1.0),
-    ],
-)
+@pytest.mark.parametrize(("asset", "unit", "up", "scale"), text_table(ASSETS))
 def test_collada_files_keep_their_unit_and_axes(tmp_path, write, load, asset, unit, up, scale):
     write("a.dae", collada(asset))
     write("label.png", encoded(noise()))
@@ -321,22 +327,12 @@ def test_threemf_reads_colours_and_textures(read_3mf):
     assert "of a kind that is not read" in read_3mf(other)[1][0]
 
 
-def test_an_axis_that_is_given_comes_before_that_of_the_file(tmp_path):
-    path = threemf(tmp_path / "a.3mf", solid(1))
-    assert cr.load_mesh(path).up == "z"
-    assert cr.load_mesh(path, up="-y").up == "-y"
-
-
-def test_threemf_of_several_models(tmp_path, read_3mf):
-    inner = threemf(tmp_path / "inner.3mf", solid(3), "")
-    with zipfile.ZipFile(inner) as archive:
-        content = archive.read("3D/3dmodel.model")
+def test_threemf_of_several_models(read_3mf):
     resources = (
         '<object id="1"><components><component p:path="/3D/Objects/a.model" '
         'objectid="3"/></components></object>'
     )
-    more = {"3D/Objects/a.model": content}
-    mesh, _ = read_3mf(resources, more=more)
+    mesh, _ = read_3mf(resources, more={"3D/Objects/a.model": model(solid(3), "")})
     assert mesh.extents.tolist() == [30.0, 20.0, 10.0]
 
 
@@ -384,7 +380,7 @@ rpy="0 1.5707963267948966 0"/></joint>
 """  # noqa: E501
 
 
-def robot(folder, base="package://arm/meshes/base.stl"):
+def arm(folder, base="package://arm/meshes/base.stl"):
     (folder / "meshes").mkdir(exist_ok=True, parents=True)
     SMALL.export(folder / "meshes" / "base.stl")
     BOX.export(folder / "meshes" / "tip.ply")
@@ -394,7 +390,7 @@ def robot(folder, base="package://arm/meshes/base.stl"):
 
 
 def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path, load):
-    mesh, texts = load(robot(tmp_path))
+    mesh, texts = load(arm(tmp_path))
     assert (mesh.unit, mesh.up, texts) == ("m", "z", [])
     # The tip's box of 0.3 x 0.2 x 0.1 is turned about z, lies 0.5 along z, and z is turned to x.
     assert_allclose(mesh.bounds[0], [-1.5, -1.0, -0.5], atol=1e-6)
@@ -411,7 +407,7 @@ def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path, load):
 
 
 def test_urdf_names_meshes_that_it_does_not_find(tmp_path, load):
-    path = robot(tmp_path / "urdf", "package://arm/other/base.stl")
+    path = arm(tmp_path / "urdf", "package://arm/other/base.stl")
     assert "other/base.stl is missing in its folder" in load(path)[1][0]
     (tmp_path / "other").mkdir()
     SMALL.export(tmp_path / "other" / "base.stl")
@@ -420,17 +416,17 @@ def test_urdf_names_meshes_that_it_does_not_find(tmp_path, load):
     assert mesh.bounds[0][0] == pytest.approx(-1.5)
 
 
-@pytest.mark.parametrize(
-    ("place", "names_package", "is_found"),
-    [
-        ("arm_description/urdf", True, True),
-        ("arm_description/robots", True, True),
-        ("arm_description/robots", False, False),
-        ("arm_description/other", True, False),
-        ("arm_description/other", "package.xml", True),
-        ("other/urdf", True, False),
-    ],
-)
+PLACES = """
+arm_description/urdf   | true        | true
+arm_description/robots | true        | true
+arm_description/robots | false       | false
+arm_description/other  | true        | false
+arm_description/other  | package.xml | true
+other/urdf             | true        | false
+"""
+
+
+@pytest.mark.parametrize(("place", "names_package", "is_found"), text_table(PLACES))
 def test_meshes_of_a_package_are_found_from_its_folder_urdf(
     tmp_path, load, place, names_package, is_found
 ):
@@ -441,9 +437,7 @@ def test_meshes_of_a_package_are_found_from_its_folder_urdf(
     if names_package == "package.xml":
         (folder.parent / "package.xml").write_text("<package/>")
     name = "package://arm_description/meshes/base.stl" if names_package else "meshes/base.stl"
-    shape = f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
-    path = folder / "arm.urdf"
-    path.write_text(f'<robot name="r"><link name="l">{shape}</link></robot>')
+    path = robot(folder / "arm.urdf", mesh_of_robot(name))
     if is_found:
         assert load(path)[0].extents.tolist() == [3.0, 2.0, 1.0]
         return
@@ -453,7 +447,7 @@ def test_meshes_of_a_package_are_found_from_its_folder_urdf(
 
 
 def test_hostile_urdf_files_are_refused(tmp_path, monkeypatch):
-    path = robot(tmp_path)
+    path = arm(tmp_path)
     text = path.read_text()
     joint = '<joint name="l" type="fixed"><parent link="ball"/><child link="base"/></joint></robot>'
     for changed, match in (

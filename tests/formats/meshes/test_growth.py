@@ -20,6 +20,7 @@ from curvireg_torch.utils.extras import is_installed
 from curvireg_torch.utils.programs import run_program
 from tests._support.refusals import refused
 from tests._support.spies import spied
+from tests.formats.meshes.packages import mesh_of_robot, robot
 from tests.formats.meshes.packages import threemf as write_package
 from tests.formats.meshes.pictures import encoded, painted
 from tests.formats.meshes.step import step_file
@@ -48,22 +49,17 @@ def peak(path):
     return most
 
 
-def robot(path, *visuals):
-    shapes = "".join(f"<visual><geometry>{one}</geometry></visual>" for one in visuals)
-    path.write_text(f'<robot name="r"><link name="l">{shapes}</link></robot>')
-    return path
-
-
 def test_names_of_urdf_are_looked_for_by_a_bounded_number_of_ends(tmp_path, monkeypatch):
     counts = []
     for parts in (10, 20, 1000, 2000):
-        mesh = f'<mesh filename="package://{"a/" * parts}b.stl"/>'
-        path = robot(tmp_path / "a.urdf", '<box size="1 1 1"/>', mesh, mesh)
+        mesh = mesh_of_robot(f"package://{'a/' * parts}b.stl")
+        box = '<geometry><box size="1 1 1"/></geometry>'
+        path = robot(tmp_path / "a.urdf", box, mesh, mesh)
         counts.append(resolved(monkeypatch, path))
     few, twice, many, most = counts
     assert many == most < few < twice <= 2 * few
     assert twice < 30
-    visuals = [f'<mesh filename="package://{k}/b.stl"/>' for k in range(60)]
+    visuals = [mesh_of_robot(f"package://{k}/b.stl") for k in range(60)]
     path = robot(tmp_path / "a.urdf", *visuals)
     monkeypatch.setattr("curvireg_torch.formats.meshes.limits.MAX_MESH_PARTS", 50)
     with refused("more than 50 parts", MeshError):
@@ -98,7 +94,7 @@ def test_copies_of_a_part_do_not_hold_its_unused_vertices(tmp_path, suffix):
     peaks = []
     for copies in (4, 16):
         if suffix == "urdf":
-            path = robot(tmp_path / "a.urdf", *['<mesh filename="a.ply"/>'] * copies)
+            path = robot(tmp_path / "a.urdf", *[mesh_of_robot("a.ply")] * copies)
         else:
             all_copies = "".join(map(copy.format, range(copies)))
             whole = f'<object id="2"><components>{all_copies}</components></object>'

@@ -19,10 +19,10 @@ from curvireg_torch.formats.meshes.polygons import triangulated
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, colour_bytes
 from curvireg_torch.utils.extras import is_installed
 from tests._support.tables import text_table
-from tests.formats.meshes.packages import solid, threemf
+from tests.formats.meshes.packages import mesh_of_robot, model, robot, solid, threemf
 from tests.formats.meshes.pictures import painted
 from tests.formats.meshes.test_gltf import TRIANGLE, Tree, coordinates, skinned, textured
-from tests.formats.meshes.test_ply import header, rows
+from tests.formats.meshes.test_ply import FACES, RGB, header, rows
 from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, square, stage, write_print
 
 needs_usd = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
@@ -230,21 +230,11 @@ def test_the_texture_of_a_polygon_is_that_of_its_triangles(pictures):
 
 
 def test_colours_of_faces_win_over_those_of_vertices(write):
-    names = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-    text = header(names, names) + rows(["255 0 0"] * 4) + "3 0 1 2 0 0 255\n3 0 2 3 0 255 0\n"
+    text = header(RGB, RGB) + rows(["255 0 0"] * 4) + "3 0 1 2 0 0 255\n3 0 2 3 0 255 0\n"
     assert first_corners(cr.load_mesh(write("a.ply", text))) == [BLUE, GREEN]
 
 
 # 3MF
-
-
-def test_a_component_lies_in_the_frame_of_a_turned_item(read_3mf):
-    turn = "0 1 0 -1 0 0 0 0 1"  # x becomes y
-    component = '<component objectid="1" transform="1 0 0 0 1 0 0 0 1 100 0 0"/>'
-    resources = solid(1) + f'<object id="2"><components>{component}</components></object>'
-    item = f'<item objectid="2" transform="{turn} 0 0 7"/>'
-    mesh, _ = read_3mf(resources, item)
-    assert_allclose(mesh.bounds, [[-10, 85, 2], [10, 115, 12]])
 
 
 def test_the_model_in_its_usual_place_is_the_first(tmp_path, load):
@@ -268,38 +258,30 @@ def test_properties_of_a_triangle_win_over_those_of_its_object(read_3mf):
 # URDF
 
 
-def robot(folder, visual, joint="", more=""):
-    path = folder / "a.urdf"
-    tip = f'<link name="tip"><visual>{visual}</visual></link>'
-    if joint:
-        tip += '<link name="base"/><joint name="j" type="fixed"><parent link="base"/>'
-        tip += f'<child link="tip"/>{joint}</joint>'
-    path.write_text(f'<robot name="r">{more}{tip}</robot>')
-    return path
-
-
 def wedge(folder):
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], [[0, 1, 2], [0, 1, 3]]).export(
         folder / "wedge.stl"
     )
-    return '<geometry><mesh filename="wedge.stl" scale="1 2 1"/></geometry>'
+    return mesh_of_robot("wedge.stl", 'scale="1 2 1"')
 
 
 def test_roll_comes_before_pitch_before_yaw(tmp_path, load):
     half = math.pi / 2
     origin = f'<origin rpy="{half} 0 {half}" xyz="10 0 0"/>'
-    mesh, _ = load(robot(tmp_path, wedge(tmp_path) + origin))
+    mesh, _ = load(robot(tmp_path / "a.urdf", wedge(tmp_path) + origin))
     # roll takes y to z and z to -y, yaw x to y and y to -x: (1, 4, 3) -> (3, 1, 4)
     assert_allclose(mesh.bounds, [[10, 0, 0], [13, 1, 4]], atol=1e-6)
     origin = f'<origin rpy="0 {half} {half}"/>'
-    mesh, _ = load(robot(tmp_path, wedge(tmp_path) + origin))
+    mesh, _ = load(robot(tmp_path / "a.urdf", wedge(tmp_path) + origin))
     # pitch takes x to -z and z to x
     assert_allclose(mesh.bounds, [[-4, 0, -1], [0, 3, 0]], atol=1e-6)
 
 
 def test_a_visual_lies_in_its_link_and_that_at_its_joint(tmp_path, load):
-    joint = f'<origin rpy="0 0 {math.pi / 2}" xyz="0 0 5"/>'
-    mesh, _ = load(robot(tmp_path, wedge(tmp_path) + '<origin xyz="10 0 0"/>', joint))
+    joint = '<link name="base"/><joint name="j" type="fixed"><parent link="base"/>'
+    joint += f'<child link="tip"/><origin rpy="0 0 {math.pi / 2}" xyz="0 0 5"/></joint>'
+    visual = wedge(tmp_path) + '<origin xyz="10 0 0"/>'
+    mesh, _ = load(robot(tmp_path / "a.urdf", visual, more=joint))
     assert_allclose(mesh.bounds, [[-4, 10, 5], [0, 11, 8]], atol=1e-6)
 
 
@@ -307,18 +289,16 @@ def test_a_colour_of_a_visual_wins_over_a_named_one(tmp_path, load):
     named = '<material name="m"><color rgba="1 0 0 1"/></material>'
     own = '<material name="m"><color rgba="0 0 1 1"/></material>'
     box = '<geometry><box size="1 1 1"/></geometry>'
-    assert first_corners(load(robot(tmp_path, box + own, more=named))[0])[0] == BLUE
+    assert first_corners(load(robot(tmp_path / "a.urdf", box + own, more=named))[0])[0] == BLUE
     bare = '<material name="m"/>'
-    assert first_corners(load(robot(tmp_path, box + bare, more=named))[0])[0] == RED
+    assert first_corners(load(robot(tmp_path / "a.urdf", box + bare, more=named))[0])[0] == RED
 
 
 def test_colours_of_a_mesh_win_over_those_of_the_urdf(tmp_path, write, load):
-    names = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-    text = header(names, "") + rows(["0 255 0"] * 4) + "3 0 1 2\n3 0 2 3\n"
-    write("a.ply", text)
-    shape = '<geometry><mesh filename="a.ply"/></geometry>'
+    write("a.ply", header(RGB, "") + rows(["0 255 0"] * 4) + FACES)
     own = '<material name="m"><color rgba="0 0 1 1"/></material>'
-    assert first_corners(load(robot(tmp_path, shape + own))[0]) == [GREEN, GREEN]
+    path = robot(tmp_path / "a.urdf", mesh_of_robot("a.ply") + own)
+    assert first_corners(load(path)[0]) == [GREEN, GREEN]
 
 
 # USD
@@ -431,8 +411,11 @@ def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(write,
         ]
         text = "".join(points) + "v 5 5 5\nf 1 2 3\nf 4 1 2\n"
     else:
-        names = "".join(f"property float {name}\n" for name in ("red", "green", "blue"))
-        text = header(names, "") + rows([*shades, "1 1 1"]) + "3 0 1 2\n3 3 0 1\n"
+        text = (
+            header(RGB.replace("uchar", "float"), "")
+            + rows([*shades, "1 1 1"])
+            + "3 0 1 2\n3 3 0 1\n"
+        )
     mesh = cr.load_mesh(write(f"a.{suffix}", text))
     assert mesh.has_colours
     assert first_corners(mesh) == [[255, 51, 0], WHITE]
@@ -487,8 +470,7 @@ def test_of_a_kind_of_warning_a_few_are_kept(tmp_path):
 
 def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path, load):
     threemf(tmp_path / "a.3mf", solid(1), unit='unit="millimeter"')
-    shape = '<geometry><mesh filename="a.3mf"/></geometry>'
-    mesh, _ = load(robot(tmp_path, shape))
+    mesh, _ = load(robot(tmp_path / "a.urdf", mesh_of_robot("a.3mf")))
     assert mesh.unit == "m"
     assert_allclose(mesh.extents, [0.03, 0.02, 0.01])
 
@@ -509,11 +491,8 @@ def test_colours_of_a_material_in_memory():
 
 
 def test_objects_of_one_number_in_two_models_are_no_copies(tmp_path, load):
-    inner = threemf(tmp_path / "inner.3mf", solid(1), "")
-    with zipfile.ZipFile(inner) as archive:
-        content = archive.read("3D/3dmodel.model")
     move = 'transform="1 0 0 0 1 0 0 0 1 100 0 0"'
     items = f'<item objectid="1"/><item objectid="1" p:path="/3D/b.model" {move}/>'
-    path = threemf(tmp_path / "a.3mf", solid(1), items, more={"3D/b.model": content})
+    path = threemf(tmp_path / "a.3mf", solid(1), items, more={"3D/b.model": model(solid(1), "")})
     mesh, _ = load(path)
     assert mesh.bounds[:, 0].tolist() == [-15, 115]

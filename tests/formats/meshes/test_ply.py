@@ -7,6 +7,7 @@ from tests.formats.meshes.pictures import encoded, noise
 
 POINTS = [(0, 0, 0), (4, 0, 0), (4, 2, 0), (0, 2, 0)]
 FACES = "3 0 1 2\n3 0 2 3\n"
+RGB = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
 SHADES = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (51, 102, 153)]
 
 
@@ -31,7 +32,7 @@ def test_colours_under_every_name(write, load, prefix, short, kind, scale):
     ]
     vertex = "".join(f"property {kind} {name}\n" for name in names)
     extra = [" ".join(f"{shade * scale:g}" for shade in shades) for shades in SHADES]
-    mesh, texts = load(write("a.ply", header(vertex, "") + rows(extra) + "3 0 1 2\n3 0 2 3\n"))
+    mesh, texts = load(write("a.ply", header(vertex, "") + rows(extra) + FACES))
     assert not texts
     np.testing.assert_array_equal(mesh.colours.corners, np.array(SHADES)[mesh.faces])
 
@@ -58,7 +59,7 @@ def test_two_textures_are_read_or_named(tmp_path, write, load):
     mesh, texts = load(write("a.ply", text))
     assert "names 2 textures and does not say which face has which" in texts[0]
     assert mesh.has_colours
-    text = header("", "", comments=comments) + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n"
+    text = header("", "", comments=comments) + rows([""] * 4) + FACES
     assert "has no texture coordinates" in load(write("a.ply", text))[1][0]
 
 

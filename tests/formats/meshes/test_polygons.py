@@ -10,6 +10,7 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes.polygons import triangulated
 from tests._support.refusals import refused
+from tests.formats.meshes.test_ply import RGB
 
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
 
@@ -71,8 +72,7 @@ def write(path, kind):
         text = "".join(f"v {p}\n" for p in points.splitlines())
         path.write_text(text + uv + "\n".join(lines) + "\n")
     else:
-        colour = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
-        colour = colour if kind == "ply with colours" else ""
+        colour = RGB if kind == "ply with colours" else ""
         header = "ply\nformat ascii 1.0\ncomment a U\nelement vertex 16\n"
         header += "".join(f"property float {axis}\n" for axis in "xyz") + "element face 10\n"
         header += f"property list uchar int vertex_indices\n{colour}end_header\n"
