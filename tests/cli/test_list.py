@@ -22,6 +22,7 @@ from curvireg_torch.pipeline import PRESETS
 from tests._support import scene, truck_bank, write_video
 from tests._support.exif import exif
 from tests._support.lists import CAMERA, RESULTS, box_of, check_pose, lines, table, written
+from tests._support.tables import text_table
 
 HEADER = "photo,x0,y0,x1,y1"
 EMPTY = [""] * 4
@@ -140,22 +141,22 @@ def test_list_without_any_result_ends_with_code_2(register_list, refused, tmp_pa
     assert "no such file" in table(tmp_path / "out")[0]["message"]
 
 
-LIMITED = [
-    # column, cell, part of the message or the prior in the result beside the elevation
-    ("azimuth", "140 220", {"azimuth": [140, 220]}),
-    ("elevation", "0 60", {"elevation": [0, 60]}),
-    ("side", "front", {"azimuth": [315, 45]}),
-    ("near", "180 20", {"viewpoint": [180, 20, 0], "within": 45}),
-    ("", "", {}),
-    ("distance", "1 2", {"distance": [1, 2]}),
-    ("distance", "1", "distance: expected"),
-    ("azimuth", "140", "azimuth: expected LOW HIGH"),
-    ("azimuth", "from 140", "azimuth: expected LOW HIGH, finite numbers, got 'from 140'"),
-    ("side", "top", "side"),
-    ("near", "1 2 3 4", "near: expected AZIMUTH"),
-    ("within", "1 2", "within: expected DEG"),
-    ("front", "z", "front: expected another axis"),
-]
+LIMITED = text_table("""
+azimuth   | 140 220  | {"azimuth": [140, 220]}
+elevation | 0 60     | {"elevation": [0, 60]}
+side      | front    | {"azimuth": [315, 45]}
+near      | 180 20   | {"viewpoint": [180, 20, 0], "within": 45}
+          |          | {}
+distance  | 1 2      | {"distance": [1, 2]}
+distance  | "1"      | distance: expected
+azimuth   | "140"    | azimuth: expected LOW HIGH
+azimuth   | from 140 | azimuth: expected LOW HIGH, finite numbers, got 'from 140'
+side      | top      | side
+near      | 1 2 3 4  | near: expected AZIMUTH
+within    | 1 2      | within: expected DEG
+front     | z        | front: expected another axis
+""")
+"""Column, cell, and a part of the message or the prior in the result beside the elevation."""
 
 
 def test_list_has_limits_of_each_row(register_list, tmp_path):

@@ -9,6 +9,7 @@ from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import MissingFileError
 from tests._support import refused
 from tests._support.miniature import write_bop, write_mesh
+from tests._support.tables import text_table
 
 
 @pytest.fixture
@@ -142,25 +143,22 @@ def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(
         BOPDataset(root)
 
 
-WHOLE = {"diameter": 86.6}
+ENTRIES = """
+{}                                                                                  | entry '1': expected a diameter > 0
+{"diameter": "100"}                                                                 | diameter
+{"diameter": 0}                                                                     | diameter
+"text"                                                                              | entry '1'
+{"diameter": 9, "symmetries_discrete": null}                                        | symmetries_discrete: expected a list
+{"diameter": 9, "symmetries_discrete": [[0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]]} | expected rigid
+{"diameter": 9, "symmetries_continuous": [{}]}                                      | axis: expected
+{"diameter": 9, "symmetries_continuous": [7]}                                       | symmetries_continuous
+{"diameter": 9}                                                                     | entry '11111111111111111111'
+"""  # noqa: E501
 
 
-@pytest.mark.parametrize(
-    ("entry", "match"),
-    [
-        ({}, "entry '1': expected a diameter > 0"),
-        ({"diameter": "100"}, "diameter"),
-        ({"diameter": 0}, "diameter"),
-        ("text", "entry '1'"),
-        (WHOLE | {"symmetries_discrete": None}, "symmetries_discrete: expected a list"),
-        (WHOLE | {"symmetries_discrete": [[0] * 16]}, "expected rigid"),
-        (WHOLE | {"symmetries_continuous": [{}]}, "axis: expected"),
-        (WHOLE | {"symmetries_continuous": [7]}, "symmetries_continuous"),
-        (WHOLE, "entry '11111111111111111111'"),
-    ],
-)
+@pytest.mark.parametrize(("entry", "match"), text_table(ENTRIES))
 def test_damaged_models_info_is_refused_when_the_dataset_is_opened(root, entry, match):
-    number = "1" * 5000 if entry is WHOLE else "1"
+    number = "1" * 5000 if entry == {"diameter": 9} else "1"
     edit(root, "../../models/models_info.json", lambda info: info.update({number: entry}))
     with refused(rf"models_info\.json: .*{match}") as caught:
         BOPDataset(root)

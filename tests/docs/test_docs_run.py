@@ -56,9 +56,7 @@ def pose(azimuth):
     points = torch.from_numpy(example_mesh().vertices.copy())
     box = torch.tensor([410.0, 220.0, 890.0, 700.0])
     view = cr.rotation_from_viewpoint(double(azimuth), 30.0, 0.0)
-    return transform(
-        *pose_from_box(points, view, box, cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0))
-    )
+    return transform(*pose_from_box(points, view, box, PHOTO_CAMERA))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +66,7 @@ def files(tmp_path_factory):
     mesh = example_mesh()
     size = (1080, 1920)
     quarter = torch.diag(double([0.25, 0.25, 1.0]))
-    K = quarter @ cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0, dtype=torch.float64)
+    K = quarter @ PHOTO_CAMERA.double()
     for seed, (name, azimuth) in enumerate(AZIMUTHS.items()):
         generator = seeded(seed)
         picture, _ = synthesize_photograph(

@@ -14,33 +14,33 @@ import curvireg_torch as cr
 from curvireg_torch import filters
 from curvireg_torch.errors import InvalidInputError
 from tests._support import double, refused, seeded
+from tests._support.tables import text_table
 
 from .layer_cases import CAMERA, PAIRS, depths, photos
 
+WRONG_VALUES = r"""
+cs        | {"sigma": -1.0}             | sigma: expected a finite number >= 0, got -1
+cs        | {"formula": "x"}            | one of 'geometric', 'paper', 'paper-length', got 'x'
+mfc       | {"threshold": 1.0}          | threshold: expected 0 <= threshold < 1, got 1.0
+mfc       | {"threshold": -0.1}         | threshold: expected a finite number >= 0
+asg       | {"camera_matrix": [[1.0]]}  | camera_matrix: expected a torch\.Tensor, got list
+diffusion | {"iterations": 1, "step": 0.3} | step: expected 0 < step <= 0.25
+mcs       | {"scales": 2.5}             | scales: expected an integer >= 1, got 2.5
+mcs       | {"sigma": "1"}              | sigma: expected a number, got str
+blur      | {"reblur_sigmas": 1.0}      | reblur_sigmas: expected a sequence
+hog       | {"grid": 8.5}               | grid: expected an integer >= 1, got 8.5
+blur      | {"reblur_sigmas": [1.0, 0.0]} | reblur_sigmas
+hog       | {"clip": 1.5}               | clip
+hog       | {"grid": 2, "block": 3}     | block <= grid
+"""
 WRONG = [
-    ("cs", {"sigma": -1.0}, "sigma: expected a finite number >= 0, got -1"),
-    (
-        "cs",
-        {"formula": "x"},
-        "formula: expected one of 'geometric', 'paper', 'paper-length', got 'x'",
-    ),
-    ("mfc", {"threshold": 1.0}, "threshold: expected 0 <= threshold < 1, got 1.0"),
-    ("mfc", {"threshold": -0.1}, "threshold: expected a finite number >= 0"),
+    *text_table(WRONG_VALUES),
     ("asg", {"camera_matrix": torch.eye(4)}, "camera_matrix: expected shape"),
-    ("asg", {"camera_matrix": [[1.0]]}, r"camera_matrix: expected a torch\.Tensor, got list"),
     (
         "asg",
         {"camera_matrix": torch.eye(3), "depth_scale": 1.0},
         "depth_scale: has no meaning with a camera_matrix",
     ),
-    ("diffusion", {"iterations": 1, "step": 0.3}, "step: expected 0 < step <= 0.25"),
-    ("mcs", {"scales": 2.5}, "scales: expected an integer >= 1, got 2.5"),
-    ("mcs", {"sigma": "1"}, "sigma: expected a number, got str"),
-    ("blur", {"reblur_sigmas": 1.0}, "reblur_sigmas: expected a sequence"),
-    ("hog", {"grid": 8.5}, "grid: expected an integer >= 1, got 8.5"),
-    ("blur", {"reblur_sigmas": (1.0, 0.0)}, "reblur_sigmas"),
-    ("hog", {"clip": 1.5}, "clip"),
-    ("hog", {"grid": 2, "block": 3}, "block <= grid"),
 ]
 
 

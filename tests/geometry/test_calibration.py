@@ -6,6 +6,7 @@ from torch.testing import assert_close
 
 from curvireg_torch.geometry import Camera, camera_matrix, project_points, undistorted
 from tests._support import double, eye, refused, seeded
+from tests._support.tables import text_table
 
 SIZE = (120, 160)
 MATRIX = camera_matrix(110.0, 112.0, 77.0, 61.0)
@@ -66,22 +67,28 @@ def test_pixels_beyond_the_valid_radius_repeat_its_border():
     assert folded[beyond.numpy()].min() < 0.05  # the centre again
 
 
-def test_unusable_cameras_and_boxes_outside_of_what_is_shown_are_refused():
+def test_boxes_outside_of_what_is_shown_are_refused():
     camera = Camera(camera_matrix(60.0, 60.0, 79.5, 59.5), (0.0,) * 4, "fisheye")
     with refused(r"box \(0, 0, 15, 15\): outside .* too far from the optical axis"):
         undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([0.0, 0, 15, 15]))
     with refused("entirely outside the 160 x 120 image"):
         undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([200.0, 0, 300, 15]))
-    for arguments, words in (
-        ({"distortion": (0.1, 0.2)}, "expected 0 or 4 or 5 or 8 or 12 or 14 finite coefficients"),
-        ({"distortion": ("a",) * 4}, "distortion: expected numbers"),
-        ({"model": "fisheye"}, "expected 4 finite coefficients"),
-        ({"matrix": torch.eye(4)}, r"camera matrix: expected shape \(3, 3\)"),
-        ({"size": (0, 640)}, "size of the image"),
-        ({"size": (480, 640, 3)}, r"size: expected height and width in px, got \(480, 640, 3\)"),
-    ):
-        with refused(words):
-            Camera(**{"matrix": MATRIX, **arguments})
+
+
+CAMERAS = r"""
+{"distortion": [0.1, 0.2]}           | expected 0 or 4 or 5 or 8 or 12 or 14 finite coefficients
+{"distortion": ["a", "a", "a", "a"]} | distortion: expected numbers
+{"model": "fisheye"}                 | expected 4 finite coefficients
+{"matrix": [[1]]}                    | camera matrix: expected shape \(3, 3\)
+{"size": [0, 640]}                   | size of the image
+{"size": [480, 640, 3]}              | size: expected height and width in px, got \[480, 640, 3\]
+"""
+
+
+@pytest.mark.parametrize(("arguments", "words"), text_table(CAMERAS))
+def test_what_is_no_camera_is_refused(arguments, words):
+    with refused(words):
+        Camera(**{"matrix": MATRIX, **arguments})
 
 
 @pytest.mark.parametrize("as_given", [np.array, torch.tensor, lambda x: np.array([x]).T])

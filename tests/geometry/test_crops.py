@@ -8,6 +8,7 @@ from curvireg_torch import geometry as g
 from curvireg_torch.geometry.crops import check_boxes, crop_squares, image_transforms
 from curvireg_torch.utils.checks import check_camera_matrix
 from tests._support import double, eye, refused
+from tests._support.tables import text_table
 
 
 def ramp(height, width):
@@ -56,16 +57,19 @@ def test_crop_squares_are_triangle_filtered(side):
         assert_close(crop, weights(y0, y1, 70) @ image @ weights(x0, x1, 90).mT)
 
 
-def test_check_boxes_refuses_boxes_without_pixels():
-    for box, match in (
-        ([float("nan"), 0.0, 5.0, 5.0], "finite"),
-        ([0.0, 0.0, 1e9, 5.0], r"beyond 1e\+06 px; give pixel coordinates of the 30 x 20"),
-        ([5.0, 0.0, 5.0, 5.0], "X0 < X1"),
-        ([-9.0, 0.0, -0.5, 5.0], "entirely outside the 30 x 20 image"),
-        ([29.5, 0.0, 40.0, 5.0], "entirely outside"),
-    ):
-        with refused(rf"box 1 .*{match}"):
-            check_boxes(torch.tensor([[0.0, 0.0, 5.0, 5.0], box]), [(20, 30), (20, 30)])
+BOXES = r"""
+[NaN, 0, 5, 5]   | finite
+[0, 0, 1e9, 5]   | beyond 1e\+06 px; give pixel coordinates of the 30 x 20
+[5, 0, 5, 5]     | X0 < X1
+[-9, 0, -0.5, 5] | entirely outside the 30 x 20 image
+[29.5, 0, 40, 5] | entirely outside
+"""
+
+
+@pytest.mark.parametrize(("box", "words"), text_table(BOXES))
+def test_check_boxes_refuses_boxes_without_pixels(box, words):
+    with refused(rf"box 1 .*{words}"):
+        check_boxes(torch.tensor([[0.0, 0.0, 5.0, 5.0], box]), [(20, 30), (20, 30)])
 
 
 def test_crop_images_refuses_a_list_of_grey_and_colour():

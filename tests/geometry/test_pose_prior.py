@@ -6,6 +6,7 @@ import torch
 from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import PosePrior, object_frame
 from tests._support import eye, refused, uniform
+from tests._support.tables import text_table
 
 
 def rotations(azimuth, elevation=0.0, theta=0.0):
@@ -19,16 +20,16 @@ def random_rotations(count):
     return rotations(360.0 * a, 160.0 * e - 80.0, 360.0 * t - 180.0)
 
 
-WRAPPED = [
-    ((300, 60), 0, 0),
-    ((300, 60), 290, 10),
-    ((300, 60), 180, 120),
-    ((60, 300), 0, 60),
-    ((0, 360), 123, 0),
-]
+WRAPPED = """
+[300, 60] | 0   | 0
+[300, 60] | 290 | 10
+[300, 60] | 180 | 120
+[60, 300] | 0   | 60
+[0, 360]  | 123 | 0
+"""
 
 
-@pytest.mark.parametrize(("limits", "azimuth", "missed"), WRAPPED)
+@pytest.mark.parametrize(("limits", "azimuth", "missed"), text_table(WRAPPED))
 def test_azimuth_limits_wrap_around_zero(limits, azimuth, missed):
     excess = PosePrior(azimuth=limits).excess(rotations(float(azimuth)))
     assert float(excess.clamp(min=0.0)) == pytest.approx(min(missed, 90), abs=1e-5)

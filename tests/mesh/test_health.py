@@ -64,37 +64,21 @@ def test_colours_stay_with_their_faces():
     np.testing.assert_array_equal(found.corners[:, 0], colours[1:])
 
 
-@pytest.mark.parametrize(
-    "whole",
-    [
-        joined(box(), box((100.0, 0.0, 0.0), (4.0, 4.0, 4.0))),  # 0.9 % of the area
-        joined(box(), box((0.0, 0.0, 60.0), (0.2, 0.2, 90.0))),  # a thin mast on the top
-        joined(box(), triangle(1.0, (34.0, 0.0, 0.0))),  # a chip near the surface
-        *(row_of_chips(axis) for axis in range(3)),
-        # a knob above a plate's middle
-        joined(box(sides=(60.0, 40.0, 1e-3)), triangle(2.0, (0.0, 0.0, 3.0))),
-        joined(box(), box(sides=(200.0, 200.0, 200.0))),
-        # a soup of loose triangles
-        joined(*(triangle(5.0, (float(k * k), float(k), 0.0)) for k in range(60))),
-        trimesh.creation.icosphere(2),
-        triangle(1.0, (0.0, 0.0, 0.0)),
-        box(sides=(1000.0, 1.0, 1.0)),
-    ],
-    ids=[
-        "body",
-        "mast",
-        "chip",
-        "row x",
-        "row y",
-        "row z",
-        "knob",
-        "inside",
-        "soup",
-        "sphere",
-        "triangle",
-        "rod",
-    ],
-)
+WHOLE = {
+    "0.9 % of the area": joined(box(), box((100.0, 0.0, 0.0), (4.0, 4.0, 4.0))),
+    "thin mast on the top": joined(box(), box((0.0, 0.0, 60.0), (0.2, 0.2, 90.0))),
+    "chip near the surface": joined(box(), triangle(1.0, (34.0, 0.0, 0.0))),
+    **{f"row of chips along {axis}": row_of_chips(axis) for axis in range(3)},
+    "knob above a plate": joined(box(sides=(60.0, 40.0, 1e-3)), triangle(2.0, (0.0, 0.0, 3.0))),
+    "inside": joined(box(), box(sides=(200.0, 200.0, 200.0))),
+    "loose triangles": joined(*(triangle(5.0, (k * k, k, 0.0)) for k in range(60))),
+    "sphere": trimesh.creation.icosphere(2),
+    "triangle": triangle(1.0, (0.0, 0.0, 0.0)),
+    "rod": box(sides=(1000.0, 1.0, 1.0)),
+}
+
+
+@pytest.mark.parametrize("whole", WHOLE.values(), ids=WHOLE)
 def test_parts_that_belong_to_the_object_stay(whole):
     assert not stray_faces(whole).any()
     mesh = as_mesh(whole)

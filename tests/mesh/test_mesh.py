@@ -1,5 +1,4 @@
 import pickle
-import warnings
 from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
@@ -145,18 +144,14 @@ def test_parts_smaller_than_what_is_welded_keep_their_edges():
 
 
 @pytest.mark.parametrize(
-    ("size", "warns"),
-    [(99.0, False), (101.0, True), (900.0, True), (0.0051, False), (0.0049, True)],
+    ("size", "count"), [(99.0, 0), (101.0, 1), (900.0, 1), (0.0051, 0), (0.0049, 1)]
 )
-def test_load_mesh_warns_of_the_size(tmp_path, size, warns):
+def test_load_mesh_warns_of_the_size(tmp_path, recwarn, size, count):
     trimesh.creation.box(np.full(3, size / 3**0.5)).export(tmp_path / "a.ply")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        cr.load_mesh(tmp_path / "a.ply")
-    assert ["m across; if that is wrong, give the unit" in str(one.message) for one in caught] == [
-        True
-    ] * warns
-    assert [one.message.kind for one in caught] == ["unit"] * warns
+    cr.load_mesh(tmp_path / "a.ply")
+    messages = [one.message for one in recwarn]
+    assert [one.kind for one in messages] == ["unit"] * count
+    assert all("m across; if that is wrong, give the unit" in str(one) for one in messages)
 
 
 def test_places_of_parts_are_multiplied_from_the_root():

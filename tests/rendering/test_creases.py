@@ -11,6 +11,7 @@ import trimesh
 from curvireg_torch.geometry import transform
 from curvireg_torch.rendering.contours import MAX_OCCLUDING, MeshContours, _Places, _Views
 from tests._support import double, eye
+from tests._support.tables import text_table
 
 SIZE = 128
 RADIUS = np.hypot(0.5, 0.5)
@@ -57,18 +58,18 @@ def test_a_crease_is_seen_from_a_fold_of_20_degrees_on(slope, expected, unit):
     assert has_crease(ridge(20.0, slope), unit) == expected
 
 
-@pytest.mark.parametrize(
-    ("half_width", "slope", "expected"),
-    [
-        (3.0, 0.22, True),  # as a wide one
-        (1.0, 0.30, False),  # half of it
-        (1.0, 0.50, True),
-        (0.5, 0.60, False),
-    ],
-)
-def test_the_surface_is_looked_up_two_pixels_beside_a_crease(half_width, slope, expected):
+RIDGES = """
+3.0 | 0.22 | true  | as a wide one
+1.0 | 0.30 | false | half of it
+1.0 | 0.50 | true  |
+0.5 | 0.60 | false |
+"""
+
+
+@pytest.mark.parametrize(("half_width", "slope", "expected", "kind"), text_table(RIDGES))
+def test_the_surface_is_looked_up_two_pixels_beside_a_crease(half_width, slope, expected, kind):
     """A 64th of the crop's side: a narrower ridge counts by its height."""
-    assert has_crease(ridge(half_width, slope)) == expected
+    assert has_crease(ridge(half_width, slope)) == expected, kind
 
 
 def plates(gap):
@@ -107,20 +108,22 @@ def test_a_step_in_depth_is_no_crease(drop, expected):
     assert has_crease(steep) == expected
 
 
+NORMALS = """
+0   | true  | true  | 0  | the same
+45  | true  | true  | 45 | of the surface
+55  | true  | true  | 55 | of the surface
+65  | true  | true  | 0  | of another surface, as at the rim of a cone
+45  | false | true  | 0  | of the edge
+45  | true  | false | 0  | of the edge
+225 | true  | true  | 45 | outward all the same
+"""
+
+
 @pytest.mark.parametrize(
-    ("degrees", "smooth", "occluding", "expected"),
-    [
-        (0.0, True, True, 0.0),
-        (45.0, True, True, 45.0),
-        (55.0, True, True, 55.0),
-        (65.0, True, True, 0.0),  # of another surface, as at the rim of a cone
-        (45.0, False, True, 0.0),
-        (45.0, True, False, 0.0),
-        (225.0, True, True, 45.0),  # outward all the same
-    ],
+    ("degrees", "smooth", "occluding", "expected", "kind"), text_table(NORMALS)
 )
 def test_normals_of_a_smooth_surface_replace_those_of_edges_they_agree_with(
-    degrees, smooth, occluding, expected
+    degrees, smooth, occluding, expected, kind
 ):
     """An edge whose normal in the image is (1, 0), of a surface whose normal is turned from it."""
     angle = np.radians(degrees)
@@ -140,4 +143,4 @@ def test_normals_of_a_smooth_surface_replace_those_of_edges_they_agree_with(
         valid=torch.tensor([[True]]),
     )
     found = _Views._smoothed(views, places, torch.tensor([occluding])).normal[0, 0].tolist()
-    assert np.degrees(np.arctan2(found[1], found[0])) == pytest.approx(expected, abs=1e-3)
+    assert np.degrees(np.arctan2(found[1], found[0])) == pytest.approx(expected, abs=1e-3), kind

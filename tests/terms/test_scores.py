@@ -12,6 +12,7 @@ from curvireg_torch import ImageGradient, ViewMatcher, terms
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.features.whitening import ledoit_wolf
 from tests._support import refused, scene, seeded
+from tests._support.tables import text_table
 
 
 def test_correlation_is_the_cosine_of_the_better_crop_scored_by_standard_deviations():
@@ -111,30 +112,34 @@ def box_score(shapes, boxes, **options):
     )
 
 
-def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio_away_from_the_border():
+def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio():
     boxes = torch.tensor([[0.0, 0, 20, 10], [0, 0, 10, 10], [0, 0, 10, 20]]) + 3.0
     expected = [math.exp(-((k * math.log(2)) ** 2) / (2 * 0.5**2)) for k in (0, 1, 2)]
     assert box_score(terms.box_shapes(boxes[:1]), boxes, sigma=0.5)[0].tolist() == pytest.approx(
         expected, rel=1e-5
     )
     assert box_score(torch.tensor([-9.0]), boxes)[0, 2] == 1.0
-    for box, whole in (
-        ([10, 10, 60, 40], True),
-        ([-0.5, 10, 60, 40], False),
-        ([10, 10, 98.8, 40], False),
-        ([10, 0, 60, 40], False),
-        ([10, 10, 60, 99], False),
-        ([-9, -9, 200, 200], False),
-        # The border is 1 px and 1/100 of the longer side, 80 px: 1.8 px.
-        ([1.4, 20, 81.4, 60], True),
-        ([1.2, 20, 81.2, 60], False),
-    ):
-        shape = terms.whole_box_shapes(torch.tensor([box], dtype=torch.float32), [(80, 100)])
-        assert bool(shape.isfinite()) == whole
-        assert (
-            bool((box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]])) == 1).all())
-            != whole
-        )
+
+
+BOXES = """
+[10, 10, 60, 40]    | true
+[-0.5, 10, 60, 40]  | false
+[10, 10, 98.8, 40]  | false
+[10, 0, 60, 40]     | false
+[10, 10, 60, 99]    | false
+[-9, -9, 200, 200]  | false
+[1.4, 20, 81.4, 60] | true
+[1.2, 20, 81.2, 60] | false
+"""
+
+
+@pytest.mark.parametrize(("box", "whole"), text_table(BOXES))
+def test_the_shape_of_a_box_at_the_border_says_nothing(box, whole):
+    """The border is 1 px and 1/100 of the longer side, 80 px: 1.8 px."""
+    shape = terms.whole_box_shapes(torch.tensor([box], dtype=torch.float32), [(80, 100)])
+    assert bool(shape.isfinite()) == whole
+    score = box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]]))
+    assert bool((score == 1).all()) != whole
 
 
 def test_jittered_fields_are_those_of_shifted_and_scaled_boxes():

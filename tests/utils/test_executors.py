@@ -39,7 +39,7 @@ def refused(_, tasks):
 class InlineExecutor:
     """An executor of this process, whose worker is lost with the tasks in ``ends``."""
 
-    def __init__(self, ends=(), error=RuntimeError, idle_losses=0):
+    def __init__(self, ends=(), error=RuntimeError):
         self.ends = ends
         self.error = error
         self.blocks = []

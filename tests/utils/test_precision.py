@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from curvireg_torch.utils import threads
 from curvireg_torch.utils.precision import full_precision
+from curvireg_torch.utils.threads import map_on_threads
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
@@ -26,12 +26,8 @@ def test_autocast_is_off_within_and_as_before_afterwards(dtype):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_jobs_compute_without_autocast_on_one_thread_and_on_several(count):
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            dtypes = threads.map_on_threads(lambda _: (torch.eye(2) @ torch.eye(2)).dtype, range(3))
-    finally:
-        torch.set_num_threads(before)
+def test_jobs_compute_without_autocast_on_one_thread_and_on_several(threads, count):
+    threads(count)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        dtypes = map_on_threads(lambda _: (torch.eye(2) @ torch.eye(2)).dtype, range(3))
     assert dtypes == [torch.float32] * 3

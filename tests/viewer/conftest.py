@@ -33,18 +33,23 @@ def address(folder):
         yield found
 
 
-@contextmanager
-def running(command, folder):
-    """Address of a viewer that a command starts, which ends without an error."""
+def started(command, folder, **more):
+    """A process whose errors go to the file ``log`` of a folder, below which its own files lie."""
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith("PYTEST")
     }
     environment |= {"CURVIREG_CACHE": str(folder / "cache"), "PYTHONPATH": str(Path.cwd())}
-    (folder / "temporary").mkdir()
-    environment["TMPDIR"] = str(folder / "temporary")
+    environment |= {"TMPDIR": str(folder), **more}
     with (folder / "log").open("w") as log:
         pipes = {"stdout": subprocess.PIPE, "stderr": log, "text": True, "bufsize": 1}
-        server = subprocess.Popen(command, cwd=folder, env=environment, **pipes)
+        return subprocess.Popen(command, cwd=folder, env=environment, **pipes)
+
+
+@contextmanager
+def running(command, folder):
+    """Address of a viewer that a command starts, which ends without an error."""
+    (folder / "temporary").mkdir()
+    server = started(command, folder, TMPDIR=str(folder / "temporary"))
     try:
         line = server.stdout.readline()
         assert "http://127.0.0.1:" in line, (folder / "log").read_text()

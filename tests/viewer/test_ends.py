@@ -4,17 +4,16 @@ uploads behind."""
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 import urllib.request
-from pathlib import Path
 
 import pytest
 
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from tests._support import scene, write_photo
+from tests.viewer.conftest import started
 
 BROWSER = """#!/bin/sh
 printf '%s' "$*" > "$SEEN.new"
@@ -48,17 +47,10 @@ def test_a_signal_removes_the_uploads_and_no_program_is_told_the_address(tmp_pat
     browser.write_text(BROWSER)
     browser.chmod(0o700)
     seen = tmp_path / "seen"
-    environment = {
-        name: value for name, value in os.environ.items() if not name.startswith("PYTEST")
-    }
-    environment |= {"BROWSER": f"{browser} %s", "SEEN": str(seen), "TMPDIR": str(tmp_path)}
-    environment |= {"PYTHONPATH": str(Path.cwd()), "CURVIREG_CACHE": str(tmp_path / "cache")}
     command = [sys.executable, "-m", "curvireg_torch", "view", "--host", host]
     before = signal.signal(number, signal.SIG_DFL)  # a process below nohup inherits that it ignores
     try:
-        with (tmp_path / "log").open("w") as log:
-            pipes = {"stdout": subprocess.PIPE, "stderr": log, "text": True}
-            process = subprocess.Popen(command, env=environment, **pipes)
+        process = started(command, tmp_path, BROWSER=f"{browser} %s", SEEN=str(seen))
     finally:
         signal.signal(number, before)
     try:

@@ -28,6 +28,11 @@ def with_small_bank(workspace, folder):
     )
 
 
+async def examined(workspace, path):
+    await workspace.open_mesh(path)
+    return await until_done(workspace)
+
+
 async def until_done(workspace, seconds=300.0):
     deadline = time.monotonic() + seconds
     while not workspace.examination.advice and time.monotonic() < deadline:
@@ -42,8 +47,7 @@ def test_a_mesh_is_examined_once_it_is_open(workspace, scene):
     async def use():
         workspace.examination.start_if_due(searching=False)
         assert not workspace.examination.running, "there is no mesh"
-        await workspace.open_mesh(scene / "truck.ply")
-        return await until_done(workspace)
+        return await examined(workspace, scene / "truck.ply")
 
     advice = asyncio.run(use())
     assert advice == "grey mesh: its sides differ in shape"
@@ -53,20 +57,16 @@ def test_a_mesh_is_examined_once_it_is_open(workspace, scene):
 def test_a_sphere_is_told_without_rendering_views(workspace, tmp_path, monkeypatch):
     monkeypatch.setattr(module.Session, "open_registrar", None)
     trimesh.creation.icosphere(2, 0.1).export(tmp_path / "ball.ply")
-
-    async def use():
-        await workspace.open_mesh(tmp_path / "ball.ply")
-        return await until_done(workspace)
-
-    assert "rotation cannot be seen" in asyncio.run(use())
+    advice = asyncio.run(examined(workspace, tmp_path / "ball.ply"))
+    assert "rotation cannot be seen" in advice
 
 
 def test_another_mesh_ends_the_examination_and_is_examined_instead(workspace, scene, monkeypatch):
-    examined = []
+    faces = []
 
     def counted(mesh):
-        examined.append(len(mesh.faces))
-        if len(examined) == 1:
+        faces.append(len(mesh.faces))
+        if len(faces) == 1:
             time.sleep(0.3)
         return mesh_facts(mesh)
 
@@ -78,11 +78,10 @@ def test_another_mesh_ends_the_examination_and_is_examined_instead(workspace, sc
         await workspace.open_mesh(scene / "truck.ply")
         workspace.examination.start_if_due(searching=False)
         await asyncio.sleep(0.1)
-        await workspace.open_mesh(scene / "ball.ply")
-        return await until_done(workspace)
+        return await examined(workspace, scene / "ball.ply")
 
     assert "rotation cannot be seen" in asyncio.run(use())
-    assert examined == [968, 320]
+    assert faces == [968, 320]
 
 
 def test_a_search_ends_the_examination_which_begins_again(workspace, scene):
@@ -123,8 +122,7 @@ def test_an_error_is_said_once_and_not_tried_again(workspace, scene, monkeypatch
     with_small_bank(workspace, scene)
 
     async def use():
-        await workspace.open_mesh(scene / "truck.ply")
-        await until_done(workspace)
+        await examined(workspace, scene / "truck.ply")
         workspace.examination.start_if_due(searching=False)
         await asyncio.sleep(0.1)
         return workspace.examination.advice

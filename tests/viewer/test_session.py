@@ -28,6 +28,7 @@ from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.shot import dragged_box
 from tests._support import double, refused, scene, write_photo
 from tests._support.exif import exif, with_exif
+from tests._support.tables import text_table
 
 VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
 
@@ -381,22 +382,23 @@ def test_register_is_cancelled_by_the_user():
     assert session.progress[0] == "bank", "at the first step"
 
 
-BOX = (10.0, 20.0, 60.0, 50.0)
+DRAGS = """
+null             | [60, 50]   | [10, 20.26] | [10, 20.3, 60, 50]
+[10, 20, 60, 50] | [200, 200] | [201, 202]  | [10, 20, 60, 50]
+[10, 20, 60, 50] | [11, 35]   | [5, 99]     | [5, 20, 60, 50]
+[10, 20, 60, 50] | [30, 19]   | [0, 25]     | [10, 25, 60, 50]
+[10, 20, 60, 50] | [59, 51]   | [80, 90]    | [10, 20, 80, 90]
+[10, 20, 60, 50] | [30, 35]   | [35, 25]    | [15, 10, 65, 40]
+[10, 20, 60, 50] | [100, 100] | [120, 130]  | [100, 100, 120, 130]
+[10, 20, 60, 50] | [10, 35]   | [90, 35]    | [60, 20, 90, 50]
+[10, 10, 16, 16] | [15.5, 13] | [30, 13]    | [10, 10, 30, 16]
+"""
 
 
-def test_a_drag_draws_moves_and_resizes_boxes():
-    for box, start, end, expected in (
-        (None, (60, 50), (10, 20.26), (10, 20.3, 60, 50)),
-        (BOX, (200, 200), (201, 202), BOX),
-        (BOX, (11, 35), (5, 99), (5, 20, 60, 50)),
-        (BOX, (30, 19), (0, 25), (10, 25, 60, 50)),
-        (BOX, (59, 51), (80, 90), (10, 20, 80, 90)),
-        (BOX, (30, 35), (35, 25), (15, 10, 65, 40)),
-        (BOX, (100, 100), (120, 130), (100, 100, 120, 130)),
-        (BOX, (10, 35), (90, 35), (60, 20, 90, 50)),
-        ((10, 10, 16, 16), (15.5, 13), (30, 13), (10, 10, 30, 16)),
-    ):
-        assert dragged_box(box, start, end, reach=4.0) == expected
+@pytest.mark.parametrize(("box", "start", "end", "expected"), text_table(DRAGS))
+def test_a_drag_draws_moves_and_resizes_boxes(box, start, end, expected):
+    found = dragged_box(box and tuple(box), tuple(start), tuple(end), reach=4.0)
+    assert found == tuple(expected)
 
 
 @pytest.fixture
