@@ -37,10 +37,10 @@ def needs(package):
 @needs("cascadio")
 @pytest.mark.usefixtures("here")
 @pytest.mark.parametrize(("unit", "suffix"), [("cm", "step"), ("in", "STP")])
-def test_step_files_keep_their_unit_and_axes(write, load, unit, suffix):
+def test_step_files_keep_their_unit_and_axes(write, unit, suffix):
     path = write(f"part.{suffix}", step_file((3.0, 2.0, 1.0), unit))
-    mesh, texts = load(path)
-    assert (mesh.unit, mesh.up, texts) == (unit, "z", [])
+    mesh = cr.load_mesh(path)
+    assert (mesh.unit, mesh.up) == (unit, "z")
     assert_allclose(mesh.bounds, [[0, 0, 0], [3, 2, 1]], atol=1e-6)
     assert mesh.surface.volume == pytest.approx(6.0, rel=1e-6)
     with refused(
@@ -390,8 +390,8 @@ def arm(folder, base="package://arm/meshes/base.stl"):
 
 
 def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path, load):
-    mesh, texts = load(arm(tmp_path))
-    assert (mesh.unit, mesh.up, texts) == ("m", "z", [])
+    mesh = cr.load_mesh(arm(tmp_path))
+    assert (mesh.unit, mesh.up) == ("m", "z")
     # The tip's box of 0.3 x 0.2 x 0.1 is turned about z, lies 0.5 along z, and z is turned to x.
     assert_allclose(mesh.bounds[0], [-1.5, -1.0, -0.5], atol=1e-6)
     assert mesh.bounds[1][0] == pytest.approx(3.25, abs=0.01)
@@ -411,8 +411,7 @@ def test_urdf_names_meshes_that_it_does_not_find(tmp_path, load):
     assert "other/base.stl is missing in its folder" in load(path)[1][0]
     (tmp_path / "other").mkdir()
     SMALL.export(tmp_path / "other" / "base.stl")
-    mesh, texts = load(path, textures=tmp_path)
-    assert not texts
+    mesh = cr.load_mesh(path, textures=tmp_path)
     assert mesh.bounds[0][0] == pytest.approx(-1.5)
 
 

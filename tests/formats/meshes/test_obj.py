@@ -49,7 +49,7 @@ def write(folder, library, name="a.mtl"):
     "encoding", ["utf-8-sig", "utf-16", "utf-16-le-mark", "latin-1", "gbk", "cr", "crlf"]
 )
 @pytest.mark.parametrize("first", ["v", "mtllib", "comment", "o"])
-def test_every_encoding_gives_the_same_mesh(write, load, encoding, first):
+def test_every_encoding_gives_the_same_mesh(write, encoding, first):
     name = {"latin-1": "Gehäuse", "gbk": "外壳"}.get(encoding, "part")
     starts = {"v": "", "mtllib": "mtllib m.mtl\n", "comment": f"# {name}\n", "o": f"o {name}\n"}
     text = starts[first] + BOX
@@ -60,8 +60,8 @@ def test_every_encoding_gives_the_same_mesh(write, load, encoding, first):
         data = text.replace("\n", "\r" if encoding == "cr" else "\r\n").encode()
     else:
         data = text.encode(encoding)
-    mesh, texts = load(write("a.obj", data))
-    assert (len(mesh.faces), mesh.extents.tolist(), texts) == (12, [3.0, 2.0, 1.0], [])
+    mesh = cr.load_mesh(write("a.obj", data))
+    assert (len(mesh.faces), mesh.extents.tolist()) == (12, [3.0, 2.0, 1.0])
 
 
 def test_materials_of_all_libraries_and_none_without_a_name(write, load):
@@ -70,13 +70,10 @@ def test_materials_of_all_libraries_and_none_without_a_name(write, load):
     write("b.mtl", "newmtl blue\nKd 0 0 1\n")
     body = f"{POINTS}usemtl red\n{HALVES[0]}usemtl blue\n{HALVES[1]}"
     for names in ("a.mtl\nmtllib b.mtl", "a.mtl b.mtl", "a.mtl\nmtllib b c.mtl"):
-        mesh, texts = load(write("a.obj", f"mtllib {names}\n{body}"))
-        colours = mesh.colours
-        assert not texts
+        colours = cr.load_mesh(write("a.obj", f"mtllib {names}\n{body}")).colours
         assert (colours.corners[:6] == [255, 0, 0]).all()
         assert (colours.corners[6:] == [0, 0, 255]).all()
-    mesh, texts = load(write("a.obj", "mtllib a.mtl\n" + body))
-    assert "lack the material blue" in texts[0]
+    assert "lack the material blue" in load(write("a.obj", "mtllib a.mtl\n" + body))[1][0]
     nameless = body.replace("usemtl blue", "usemtl")
     colours = load(write("a.obj", "mtllib a.mtl\n" + nameless))[0].colours
     assert (colours.corners[6:] == 255).all(), "no name: no material"
@@ -100,28 +97,26 @@ TEXTURE_OPTIONS = """
     "name",
     ["label.png", "my label.png", "LABEL.PNG", '"label.png"', "maps\\label.png", "./label.png"],
 )
-def test_options_of_a_texture_precede_its_name(tmp_path, load, options, scale, offset, name):
+def test_options_of_a_texture_precede_its_name(tmp_path, options, scale, offset, name):
     folder = tmp_path / "maps" if "maps" in name else tmp_path
     file = name.replace("maps\\", "").strip('"')
     pixels = picture(folder / (file.lower() if name.isupper() else file))
     path = write(tmp_path, f"newmtl label\nKd 1 1 1\nmap_Kd {options} {name}\n")
-    mesh, texts = load(path)
+    mesh = cr.load_mesh(path)
     colours = mesh.colours
-    assert not texts
     np.testing.assert_array_equal(colours.textures[0], pixels)
     expected = np.array([[0, 0], [1, 0], [0, 1]]) * scale + offset
     np.testing.assert_allclose(colours.uv, np.broadcast_to(expected, (12, 3, 2)), atol=1e-6)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "gbk"])
-def test_a_library_in_another_encoding_finds_its_texture(tmp_path, load, encoding):
+def test_a_library_in_another_encoding_finds_its_texture(tmp_path, encoding):
     name = "标签.png" if encoding == "gbk" else "Gehäuse.png"
     picture(tmp_path / name)
     path = write(tmp_path, "")
     (tmp_path / "a.mtl").write_bytes(f"newmtl label\nmap_Kd {name}\n".encode(encoding))
-    mesh, texts = load(path)
+    mesh = cr.load_mesh(path)
     assert mesh.has_colours
-    assert not texts
 
 
 def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_is_given(
@@ -135,9 +130,8 @@ def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_i
         assert not mesh.has_colours
         assert "label.png" in text
         assert [warning.kind for warning in mesh.warnings] == ["texture"]
-        mesh, texts = load(path, textures=tmp_path / "images")
+        mesh = cr.load_mesh(path, textures=tmp_path / "images")
         assert mesh.has_colours
-        assert not texts
     path = write(tmp_path / "models", "newmtl label\nmap_Kd ../images/label.png\n")
     assert "lies outside of its folder" in load(path)[1][0]
     assert load(path, textures=tmp_path)[0].has_colours
@@ -191,7 +185,7 @@ def test_an_obj_of_many_parts_is_refused(write):
             cr.load_mesh(path)
 
 
-def test_a_can_of_two_materials_that_look_alike_is_grey(write, load):
+def test_a_can_of_two_materials_that_look_alike_is_grey(write):
     """No print, and all its symmetries."""
     can = trimesh.creation.cylinder(30.0, 100.0, sections=96)
     points = "".join(f"v {x} {y} {z}\n" for x, y, z in can.vertices)
@@ -200,8 +194,7 @@ def test_a_can_of_two_materials_that_look_alike_is_grey(write, load):
     library = "newmtl steel\nKd 0.6 0.6 0.6\nnewmtl chrome\nKd 0.61 0.6 0.6\n"
     write("two.mtl", library)
     text = f"mtllib two.mtl\n{points}{UV}usemtl steel\n{''.join(rows)}"
-    mesh, texts = load(write("can.obj", text), unit="mm")
-    assert not texts
+    mesh = cr.load_mesh(write("can.obj", text), unit="mm")
     assert not mesh.has_colours
     assert len(mesh_symmetries(mesh)) == 72
 
