@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 PROGRAMS = [
     next(filter(None, map(shutil.which, names)), None)
@@ -59,6 +60,15 @@ class Browser:
     def part(self, name):
         return self.find(f'[data-testid="{name}"]')
 
+    def images(self, name):
+        return self.part(name).find_elements("css selector", "img")
+
+    def canvas(self, name):
+        return self.wait(lambda: self.part(name).find_element("css selector", "canvas"), name)
+
+    def is_pressed(self, name):
+        return self.part(name).get_attribute("aria-pressed") == "true"
+
     def script(self, code, *arguments):
         return self.driver.execute_script(code, *arguments)
 
@@ -91,6 +101,13 @@ class Browser:
 
     def shows(self, name, text):
         self.wait(lambda: self.text(name) == text, f"{name}: {text}")
+
+    def contains(self, name, text, count=1):
+        """Wait until a part shows a text so many times."""
+        self.wait(lambda: self.text(name).count(text) == count, f"{name}: {count} {text}")
+
+    def has_box(self, *box, within=2.0):
+        self.wait(lambda: self.box() == pytest.approx(box, abs=within), f"box {box}")
 
     def begins(self, name, text):
         self.wait(lambda: self.text(name).startswith(text), f"{name}: {text}...")

@@ -60,9 +60,7 @@ def hinted_azimuth(browser):
 def test_the_model_turned_with_the_mouse_is_a_hint(browser):
     browser.emulate(1440, 900)
     browser.unfold("command-line")
-    canvas = browser.wait(
-        lambda: browser.part("preview").find_element("css selector", "canvas"), "the model"
-    )
+    canvas = browser.canvas("preview")
     labels = """
         const all = [...document.querySelectorAll('.nicegui-scene div')];
         return all.filter(e => !e.children.length && e.textContent).map(e => e.textContent)"""
@@ -81,11 +79,11 @@ def test_the_model_turned_with_the_mouse_is_a_hint(browser):
     )
     browser.picture("viewer-model", "fold-model")
     browser.click("no-prior")
-    browser.wait(lambda: "--near" not in browser.text("command"), "no hint")
+    browser.contains("command", "--near", 0)
     browser.click("mark-front")
     browser.shows("prior-facts", "Click on the side that is front.")
     browser.mouse().move_to_element_with_offset(canvas, -22, 0).click().perform()
-    browser.wait(lambda: "Click" not in browser.text("prior-facts"), "clicked")
+    browser.contains("prior-facts", "Click", 0)
 
 
 STOP_ONCE_IT_RUNS = """
@@ -118,14 +116,12 @@ def test_a_reload_keeps_photograph_mesh_box_and_answer(browser):
     before = [browser.text(name) for name in names]
     browser.driver.refresh()
     browser.wait(lambda: [browser.text(name) for name in names] == before, "everything again")
-    images = browser.part("photograph").find_elements("css selector", "img")
+    images = browser.images("photograph")
     browser.wait(
         lambda: [int(image.get_attribute("naturalWidth")) for image in images] == [600] * 3,
         "layers",
     )
-    browser.wait(
-        lambda: len(browser.part("panel-answer").find_elements("css selector", "img")) > 1, "cards"
-    )
+    browser.wait(lambda: len(browser.images("panel-answer")) > 1, "cards")
     assert browser.text("progress") == "done"
     browser.picture("viewer", "answer-1")
 
@@ -135,8 +131,8 @@ def test_the_card_that_is_clicked_is_the_answer_that_is_shown_and_saved(browser)
     first = saved(browser)
     assert first["viewer"]["command"] == browser.text("command")
     browser.click("answer-2")
-    browser.wait(lambda: browser.part("answer-2").get_attribute("aria-pressed") == "true", "chosen")
-    assert browser.part("answer-1").get_attribute("aria-pressed") == "false"
+    browser.wait(lambda: browser.is_pressed("answer-2"), "chosen")
+    assert not browser.is_pressed("answer-1")
     second = saved(browser)
     assert second["rotation"] == first["hypotheses"][1]["rotation"] != first["rotation"]
     for name, start in (("pose.glb", b"glTF"), ("overlay.png", b"\x89PNG")):
@@ -144,9 +140,7 @@ def test_the_card_that_is_clicked_is_the_answer_that_is_shown_and_saved(browser)
         assert browser.downloaded(name).startswith(start)
     assert browser.text("verdict") == "your choice"
     browser.click("answer-1")
-    browser.wait(
-        lambda: browser.part("answer-1").get_attribute("aria-pressed") == "true", "the first again"
-    )
+    browser.wait(lambda: browser.is_pressed("answer-1"), "the first again")
     assert browser.text("used-camera").endswith(": the camera is known by its field of view")
 
 
@@ -164,25 +158,25 @@ def test_the_pose_is_corrected_on_the_photograph(browser):
         )
 
     browser.drag(middle, (middle[0] + 36, middle[1]), 600, held=follows)
-    browser.wait(lambda: "moved: rotated 0.0 degrees" in browser.text("facts"), "moved")
+    browser.contains("facts", "moved: rotated 0.0 degrees")
     assert browser.text("verdict") == "by hand"
     moved = saved(browser)
     pixels = (moved["translation"][0] - before["translation"][0]) * before["inputs"]["camera"][0]
     assert pixels / before["translation"][2] == pytest.approx(36, abs=4)
     browser.drag((20, 20), (60, 45), 600)  # beside the mesh
-    browser.wait(lambda: browser.text("facts").count("moved: ") == 2, "turned")
+    browser.contains("facts", "moved: ", 2)
     browser.picture("viewer-hand")
     browser.click("undo")
-    browser.wait(lambda: browser.text("facts").count("moved: ") == 1, "undone")
+    browser.contains("facts", "moved: ")
     assert saved(browser)["rotation"] == moved["rotation"]
     scroll(browser, browser.part("photograph"), 200)
-    browser.wait(lambda: browser.text("facts").count("moved: ") == 2, "further away")
+    browser.contains("facts", "moved: ", 2)
     assert saved(browser)["translation"][2] > 1.05 * moved["translation"][2]
     browser.click("fit")
-    browser.wait(lambda: "contours fitted" in browser.text("facts"), "contours")
+    browser.contains("facts", "contours fitted")
     browser.click("answer-1")
     browser.wait(lambda: browser.extent(600) == at_rest, "as it was found")
-    layer = browser.part("photograph").find_elements("css selector", "img")[1]
+    layer = browser.images("photograph")[1]
     assert layer.value_of_css_property("opacity") == "0.35"
     browser.part("mesh").click()  # in the middle
     browser.wait(lambda: 0.45 < float(layer.value_of_css_property("opacity")) < 0.55, "opacity", 20)
@@ -210,7 +204,7 @@ def test_the_program_is_copied(browser):
 def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(browser):
     browser.emulate(1440, 900)
     before = browser.text("certainty")
-    canvas = browser.part("preview").find_element("css selector", "canvas")
+    canvas = browser.canvas("preview")
     start = hinted_azimuth(browser)
     browser.script("arguments[0].scrollIntoView({block: 'center'})", canvas)
     drag = browser.mouse().move_to_element(canvas).click_and_hold().move_by_offset(120, 0)
@@ -225,7 +219,7 @@ def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(brow
     browser.click("no-prior")
     browser.click("register")
     browser.shows("progress", "done")
-    browser.wait(lambda: browser.text("certainty") == before, "as before")
+    browser.shows("certainty", before)
     assert browser.messages() == []
 
 
@@ -294,7 +288,7 @@ def test_keys_undo_and_zoom_change_the_box(browser):
         chain.perform()
 
     def becomes(*box):
-        browser.wait(lambda: browser.box() == pytest.approx(box, abs=0.01), f"{box}", 20)
+        browser.has_box(*box, within=0.01)
 
     press(Keys.ARROW_RIGHT)
     becomes(x0 + 1, y0, x1 + 1, y1)
@@ -321,9 +315,9 @@ def test_keys_undo_and_zoom_change_the_box(browser):
     browser.find("[data-zoom=fit]").click()
     browser.wait(lambda: image.size["width"] == width, "as before")
     browser.drag((10, 250), (120, 350), 600)
-    browser.wait(lambda: browser.box() == pytest.approx([10, 250, 120, 350], abs=2), "drawn box")
+    browser.has_box(10, 250, 120, 350)
     browser.drag((120, 300), (150, 300), 600)
-    browser.wait(lambda: browser.box() == pytest.approx([10, 250, 150, 350], abs=2), "moved edge")
+    browser.has_box(10, 250, 150, 350)
 
 
 def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(browser, folder):
@@ -340,11 +334,10 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     assert browser.messages() == []
     browser.unfold("camera")
     browser.click("exif")
-    caption = "from the photograph's EXIF, 37 mm of a 35 mm camera"
-    browser.wait(lambda: browser.text("camera-facts") == caption, "EXIF")
+    browser.shows("camera-facts", "from the photograph's EXIF, 37 mm of a 35 mm camera")
     browser.unfold("command-line")
     browser.part("fov").send_keys("65\n")
-    browser.wait(lambda: "--fov 65" in browser.text("command"), "field of view")
+    browser.contains("command", "--fov 65")
     (folder / "notes.txt").write_text("nothing to see")
     browser.drop(folder / "broken.png", folder / "hostile.obj", folder / "notes.txt")
     browser.wait(lambda: len(browser.messages()) == 3, "three messages")
@@ -362,7 +355,7 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     mesh.apply_scale(1000.0)
     mesh.export(folder / "large.ply")
     browser.upload("mesh", folder / "large.ply")
-    browser.wait(lambda: "give the unit (mm?)" in browser.text("message-mesh"), "a question")
+    browser.contains("message-mesh", "give the unit (mm?)")
     browser.picture("viewer-repair", "step-mesh")
     browser.click("use-mm")
     browser.wait(lambda: browser.text("mesh-facts").endswith(" mm, rendered in grey"), "in mm")
@@ -379,8 +372,8 @@ def test_each_of_several_photographs_keeps_its_box(browser, folder):
     browser.begins("mesh-facts", "table.ply: ")
     x0, y0, x1, y1 = scene.box.tolist()
     browser.drag((x0, y0), (x1, y1), 960)
-    browser.wait(lambda: browser.box() == pytest.approx([x0, y0, x1, y1], abs=2), "its box")
-    thumbnails = browser.part("strip").find_elements("css selector", "img")
+    browser.has_box(x0, y0, x1, y1)
+    thumbnails = browser.images("strip")
     assert [image.get_attribute("alt") for image in thumbnails][-2:] == list(scenes)
     for number, is_there in ((len(thumbnails) - 1, False), (len(thumbnails), True)):
         browser.click(f"photograph-{number}")
@@ -388,17 +381,11 @@ def test_each_of_several_photographs_keeps_its_box(browser, folder):
             lambda is_there=is_there: (browser.box() is not None) == is_there, f"box of {number}"
         )
 
-    def count():
-        return len(browser.part("strip").find_elements("css selector", "img"))
-
     for left in range(len(thumbnails) - 1, 1, -1):  # those of the tests before
         browser.click("photograph-1")
-        browser.wait(
-            lambda: browser.part("photograph-1").get_attribute("aria-pressed") == "true",
-            "the first",
-        )
+        browser.wait(lambda: browser.is_pressed("photograph-1"), "the first")
         browser.click("no-photo")
-        browser.wait(lambda n=left: count() == n, f"{left} left")
+        browser.wait(lambda n=left: len(browser.images("strip")) == n, f"{left} left")
     browser.click("photograph-2")
     browser.wait(lambda: browser.box() is not None, "the last one")
     browser.picture("viewer-box", "step-box")
@@ -413,7 +400,7 @@ def test_an_answer_is_zoomed_to_and_the_pointer_shows_what_a_drag_does(browser, 
     browser.begins("mesh-facts", "truck.ply: ")
     browser.begins("photograph-facts", "photo.png: ")
     canvas = browser.part("photograph")
-    browser.wait(lambda: canvas.find_element("css selector", "img").size["width"] > 100, "shown")
+    browser.wait(lambda: browser.images("photograph")[0].size["width"] > 100, "shown")
     browser.drag((102, 70), (156, 147), 240)
     browser.wait(lambda: browser.box() is not None, "box")
     browser.click("register")
@@ -452,16 +439,14 @@ def test_an_answer_is_zoomed_to_and_the_pointer_shows_what_a_drag_does(browser, 
     x0, y0, x1, y1 = extent()
     browser.wait(lambda: aim((x0 + x1) / 2, (y0 + y1) / 2) == "move", "the mesh would move")
     browser.wait(lambda: aim(0.02, 0.02) == "turn", "the mesh would turn")
-    lines = canvas.find_elements("css selector", "img")[2]
+    lines = browser.images("photograph")[2]
     assert lines.is_displayed()
     browser.part("contours").click()
     browser.wait(lambda: not lines.is_displayed(), "without contours")
     browser.part("contours").click()
     browser.wait(lambda: lines.is_displayed(), "with contours")
     browser.click("show-space")
-    browser.wait(
-        lambda: browser.part("space").find_element("css selector", "canvas"), "the answer in 3D"
-    )
+    assert browser.canvas("space"), "the answer in 3D"
     browser.find("[data-zoom=fit]").click()
     browser.wait(lambda: canvas.size["width"] > 1.05 * whole, "the object")
     (folder / "next.png").write_bytes((folder / "photo.png").read_bytes())
@@ -505,8 +490,7 @@ def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
         box = pytest.approx(scene.box.tolist(), abs=4)
         browser.wait(lambda box=box: browser.extent(960) == box, f"mesh {number}")
         assert browser.part("answers").is_displayed()
-    browser.click("download-result.json")
-    document = json.loads(browser.downloaded("result.json"))
+    document = saved(browser)
     assert document["frame"] == "world"
     assert [view["photo"] for view in document["photographs"]] == ["table-4.png", "table-5.png"]
     assert rotation_error(torch.tensor(document["rotation"]), torch.eye(3)) < 3
