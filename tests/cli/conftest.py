@@ -64,6 +64,17 @@ def document(tmp_path):
 
 
 @pytest.fixture
+def registered(register_one, document):
+    """:func:`register_one` of what can be registered; returns its document."""
+
+    def run(*words, **files):
+        assert register_one(*words, **files) == 0
+        return document()
+
+    return run
+
+
+@pytest.fixture
 def register(tmp_path):
     """Run ``curvireg register`` without refinement; results go to ``tmp_path / out``."""
 

@@ -29,12 +29,12 @@ def _exif_photographs(folder):
 
 
 @pytest.fixture
-def register_photo(register_one, document, capsys):
+def register_photo(registered, capsys):
     """Register one photograph; returns the document and what was printed."""
 
     def run(photo, *words):
-        assert register_one(*words, photo=photo, mesh="learned.safetensors") == 0
-        return document(), capsys.readouterr().out
+        found = registered(*words, photo=photo, mesh="learned.safetensors")
+        return found, capsys.readouterr().out
 
     return run
 
@@ -136,12 +136,11 @@ def test_a_photograph_is_decoded_and_undistorted_once_for_all_meshes(
     assert remap.call_count == 3  # red, green and blue
 
 
-def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, register_one, document):
+def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, registered):
     box, T = lens
     files = {"photo": "distorted.png", "mesh": "learned.safetensors"}
     words = ["--camera", folder / "cam.json", "--format", "ros"]
-    assert register_one(*words, **files, box=box) == 0
-    found = document()
+    found = registered(*words, **files, box=box)
     check_pose(found, T, 3.0, 0.03)
     assert found["covariance"] is not None
     assert (found["camera"]["distortion"][0], found["camera"]["size"]) == (-0.25, [180, 240])

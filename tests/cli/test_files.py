@@ -56,11 +56,10 @@ def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
     assert "no such file" in figures[-1][1]
 
 
-def test_register_writes_the_mesh_at_its_pose(register_one, document, tmp_path, monkeypatch):
+def test_register_writes_the_mesh_at_its_pose(register_one, registered, tmp_path, monkeypatch):
     out = tmp_path / "out"
     words = ["--no-refine", "--camera", *CAMERA]
-    assert register_one(*words) == 0
-    found = document()
+    found = registered(*words)
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     T = flip @ trimesh.load(out / "pose.glb").graph["object"][0]
     np.testing.assert_allclose(T[:3], np.c_[found["rotation"], found["translation"]], atol=1e-5)

@@ -22,9 +22,8 @@ from tests._support.tables import text_table
 
 
 @pytest.mark.usefixtures("drawn")
-def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
-    assert register_one("--camera", *CAMERA, "--hypotheses", "3", mesh="learned.safetensors") == 0
-    result = document()
+def test_register_writes_result_and_overlay(registered, tmp_path, capsys):
+    result = registered("--camera", *CAMERA, "--hypotheses", "3", mesh="learned.safetensors")
     # swapped CX and CY would move it by 30 px of 260: 0.16 of its distance
     check_pose(result, scene(0)[2], 15.0, 0.05)
     assert len(result["hypotheses"]) == 3
@@ -41,43 +40,42 @@ def test_register_writes_result_and_overlay(register_one, document, tmp_path, ca
     assert "standard deviations: " in printed
 
 
-def test_register_is_told_that_a_box_is_that_of_the_visible_part(register_one, document):
+def test_register_is_told_that_a_box_is_that_of_the_visible_part(registered):
     for words, box_is in (((), "whole"), (("--box-is", "visible"), "visible")):
-        assert register_one("--no-refine", *words) == 0
-        assert document()["pipeline"]["box_is"] == box_is
+        assert registered("--no-refine", *words)["pipeline"]["box_is"] == box_is
 
 
-def test_register_without_box_and_camera(folder, register_one, document, capsys):
+def test_register_without_box_and_camera(folder, registered, capsys):
     files = [str(folder / name) for name in ("photos/0.png", "truck.safetensors")]
     words = ["register", *files, "--no-refine", "--json"]
     assert main([*words, "--box", *box_of(0)]) == 0
     assert "detecting" not in capsys.readouterr().err
     assert main(words) == 0
     assert "0.png: detecting the object" in capsys.readouterr().err
-    assert register_one("--no-refine", "--mesh-is", "similar") == 0
+    found = registered("--no-refine", "--mesh-is", "similar")
     assert capsys.readouterr().err == ""
     keys = ("translation", "covariance", "standard_deviations", "camera", "camera_source")
-    assert {document()[key] for key in keys} == {None}
-    assert document()["pipeline"]["contours"] is False
+    assert {found[key] for key in keys} == {None}
+    assert found["pipeline"]["contours"] is False
 
 
 @pytest.mark.parametrize(
     ("name", "options", "up"), slow_after(1, [("x.ply", ["--up=-x"], "-x"), ("y.glb", [], "y")])
 )
 def test_register_upright_mesh_with_another_up_axis(
-    folder, register_one, document, monkeypatch, name, options, up
+    folder, registered, monkeypatch, name, options, up
 ):
     monkeypatch.setenv("CURVIREG_CACHE", str(folder / "cache"))
     T = np.eye(4)
     T[:3, :3] = up_rotation(up).numpy().T
     example_mesh().apply_transform(T).export(folder / name)
-    assert register_one("--pose", "upright", "--no-refine", *options, mesh=name) == 0
-    found = double(document()["rotation"])
+    result = registered("--pose", "upright", "--no-refine", *options, mesh=name)
+    found = double(result["rotation"])
     assert rotation_error(found, scene(0)[2][:3, :3] @ up_rotation(up)) < 15
 
 
 def test_an_upright_mesh_that_is_not_recognised_is_told_which_axis_was_taken_as_up(
-    folder, register_one, document, capsys
+    folder, registered, capsys
 ):
     """OBJ names no axis; many programs write y up, and z is assumed."""
     mesh = example_mesh()
@@ -85,10 +83,10 @@ def test_an_upright_mesh_that_is_not_recognised_is_told_which_axis_was_taken_as_
     mesh.export(folder / "y.obj")
     hint = "--pose upright: z of the mesh is taken as up; --up names another"
     words = ("--pose", "upright", "--preset", "fast", "--unit", "m")
-    assert register_one(*words, mesh="y.obj") == 0
-    assert document()["confidence"] is None or document()["confidence"] < 0.5
+    confidence = registered(*words, mesh="y.obj")["confidence"]
+    assert confidence is None or confidence < 0.5
     assert hint in capsys.readouterr().out
-    assert register_one(*words, "--up", "y", mesh="y.obj") == 0
+    registered(*words, "--up", "y", mesh="y.obj")
     assert hint not in capsys.readouterr().out
 
 
@@ -100,38 +98,36 @@ def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, ref
     refused(register_one("--camera", "exif"), "0.png", "no focal length")
 
 
-def test_register_warns_of_a_questionable_camera(register_one, document, capsys):
-    assert register_one("--no-refine", "--camera", "119", "119", "260", "260") == 0
-    (line,) = document()["warnings"]
+def test_register_warns_of_a_questionable_camera(registered, capsys):
+    found = registered("--no-refine", "--camera", "119", "119", "260", "260")
+    (line,) = found["warnings"]
     assert "FX FY and CX CY seem to be swapped" in line
     assert f"0.png: {line}" in capsys.readouterr().err
-    assert document()["reliable"] is False
+    assert found["reliable"] is False
 
 
 def test_register_takes_views_from_the_bank_unless_a_pipeline_file_is_given(
-    folder, register_one, document, capsys
+    folder, register_one, registered, capsys
 ):
     views = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
     bank = bank_of(example_mesh(), pipeline=replace(PRESETS["fast"], views=views))
     bank.save(folder / "upright.safetensors")
-    assert register_one("--preset", "fast", mesh="upright.safetensors") == 0
-    assert document()["pipeline"]["views"]["azimuth_step"] == 120.0
+    found = registered("--preset", "fast", mesh="upright.safetensors")
+    assert found["pipeline"]["views"]["azimuth_step"] == 120.0
     (folder / "pipeline.json").write_text(PRESETS["fast"].to_json())
     assert register_one("--pipeline", folder / "pipeline.json", mesh="upright.safetensors") == 2
     assert "pose upright, " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("preset", slow_after(2, sorted(PRESETS, reverse=True)))
-def test_register_equals_registrar_bit_by_bit(folder, register_one, document, monkeypatch, preset):
+def test_register_equals_registrar_bit_by_bit(folder, registered, monkeypatch, preset):
     monkeypatch.setenv("CURVIREG_CACHE", str(folder / "equal"))
     # The views of every preset, thinned out: 12 instead of 7200.
     views = ViewPolicy(directions=12, theta_step=360.0)
     (folder / "pipeline.json").write_text(replace(PRESETS[preset], views=views).to_json())
-    assert (
-        register_one("--pipeline", folder / "pipeline.json", "--camera", *CAMERA, mesh="truck.ply")
-        == 0
+    written = registered(
+        "--pipeline", folder / "pipeline.json", "--camera", *CAMERA, mesh="truck.ply"
     )
-    written = document()
     registrar = Registrar(
         str(folder / "truck.ply"), pipeline=Pipeline.read(folder / "pipeline.json")
     )
@@ -147,14 +143,11 @@ def test_register_equals_registrar_bit_by_bit(folder, register_one, document, mo
     assert written["pipeline"] == registrar.pipeline.describe()
 
 
-def test_register_limits_the_pose(register_one, document):
+def test_register_limits_the_pose(registered):
     azimuth = viewpoint_from_rotation(scene(0)[2][:3, :3])[0]
     low = float(azimuth + 140) % 360
     high = float(azimuth + 220) % 360
-    assert (
-        register_one("--no-refine", "--azimuth", f"{low},{high}", "--elevation", "-90", "90") == 0
-    )
-    result = document()
+    result = registered("--no-refine", "--azimuth", f"{low},{high}", "--elevation", "-90", "90")
     assert result["prior"] == {
         "azimuth": [low, high],
         "elevation": [-90, 90],
@@ -165,7 +158,7 @@ def test_register_limits_the_pose(register_one, document):
 
 
 def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
-    folder, register_one, document, refused
+    folder, register_one, registered, refused
 ):
     mesh = example_mesh()
     mesh.units = "mm"
@@ -181,8 +174,7 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
         register_one("--up=-x", "--no-refine", **bank), "mm.safetensors: built with z up, not -x"
     )
     words = ["--unit", "mm", "--up", "z", "--no-refine"]
-    assert register_one(*words, **bank) == 0
-    assert document()["unit"] == "mm"
+    assert registered(*words, **bank)["unit"] == "mm"
     assert register_one("--no-refine", **bank) == 0
     mesh.units = None
     bank_of(mesh, **views).save(folder / "mm.safetensors")
@@ -213,7 +205,7 @@ def test_the_pose_in_the_world_of_a_rig_is_no_start(folder, register_one, refuse
 
 
 def test_starts_of_other_tools_have_their_convention_and_unit(
-    folder, register_one, refused, document
+    folder, register_one, registered, refused
 ):
     T = scene(0)[2].double()
     flip = torch.diag(double([1.0, -1.0, -1.0, 1.0]))
@@ -224,30 +216,29 @@ def test_starts_of_other_tools_have_their_convention_and_unit(
         "a pose of OpenGL's camera? Then turn y and z around; or give --start-convention opengl"
     )
     refused(register_one(*words, box=()), f"behind the camera: {message}")
-    assert register_one(*words, "--start-convention", "opengl", box=()) == 0
-    assert rotation_error(double(document()["rotation"]), T[:3, :3]) < 3.0
+    turned = registered(*words, "--start-convention", "opengl", box=())
+    assert rotation_error(double(turned["rotation"]), T[:3, :3]) < 3.0
     entry = {
         "cam_R_m2c": T[:3, :3].flatten().tolist(),
         "cam_t_m2c": (1000.0 * T[:3, 3]).tolist(),
         "obj_id": 1,
     }
     path.write_text(json.dumps({"4": [entry]}))  # mm, of a mesh in m
-    assert register_one("--start", f"{path}:4", "--camera", *CAMERA, box=()) == 0
-    torch.testing.assert_close(double(document()["translation"]), T[:3, 3], rtol=0.1, atol=0.05)
+    of_bop = registered("--start", f"{path}:4", "--camera", *CAMERA, box=())
+    torch.testing.assert_close(double(of_bop["translation"]), T[:3, 3], rtol=0.1, atol=0.05)
     with pytest.raises(SystemExit):
         register_one("--start-convention", "opengl")
 
 
 def test_register_refines_a_start_or_writes_that_the_object_is_lost(
-    folder, register_one, document, capsys
+    folder, register_one, registered, document, capsys
 ):
     T = scene(0)[2]
     path = folder / "start.json"
     pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}
     path.write_text(json.dumps(pose))
     words = "--start", str(path), "--camera", *CAMERA
-    assert register_one(*words, box=()) == 0
-    result = document()
+    result = registered(*words, box=())
     assert rotation_error(double(result["rotation"]), scene(0)[2][:3, :3]) < 3.0
     assert set(result["confidence_features"]) == {"similarity", "edge_support"}
     pose["translation"][0] += 100.0
