@@ -1,22 +1,23 @@
 """The 2D detectors that the paper compares.
 
-``DETECTORS[name](image, fraction=0.04)`` takes (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W)
+``DETECTORS[name](image, fraction)`` takes (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W)
 RGB, and returns the feature points, (B, 1, H, W) bool: at most the fraction of the pixels except
 for ties.
 """
 
 import functools
 from collections.abc import Callable
+from typing import TypeAlias
 
 import cv2
 import numpy as np
+import skimage.feature
 import torch
 import torch.nn.functional as F
 from kornia.feature import gftt_response, harris_response
 from kornia.filters import spatial_gradient
 from torch import Tensor
 
-from curvireg_torch.errors import MissingDependencyError
 from curvireg_torch.features import field_points
 from curvireg_torch.features.fields import FIELDS
 from curvireg_torch.features.hog import strongest_points
@@ -34,21 +35,17 @@ from curvireg_torch.filters.operations import (
     to_grey,
 )
 
-try:
-    import skimage.feature
-except ImportError as error:
-    message = "scikit-image is not installed; pip install 'curvireg_torch[paper]'"
-    raise MissingDependencyError(f"detectors: {message}") from error
-
 __all__ = ["DETECTORS"]
 
+Detector: TypeAlias = Callable[[Tensor, float], Tensor]
 
-def detector(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+
+def detector(function: Detector) -> Detector:
     """Decorator that lets a detector on grey levels accept RGB and half types."""
 
     @functools.wraps(function)
-    def on_photograph(image: Tensor, **options: float) -> Tensor:
-        return function(to_grey(at_least_float32(image)), **options)
+    def on_photograph(image: Tensor, fraction: float) -> Tensor:
+        return function(to_grey(at_least_float32(image)), fraction)
 
     return on_photograph
 
@@ -61,13 +58,13 @@ def peaks(response: Tensor, fraction: float) -> Tensor:
 
 
 @detector
-def sobel(image: Tensor, *, fraction: float = 0.04) -> Tensor:
+def sobel(image: Tensor, fraction: float) -> Tensor:
     """Gradient by the Sobel kernels per px (their sums divided by 8), borders replicated."""
     return field_points(spatial_gradient(image)[:, 0], fraction=fraction)
 
 
 @detector
-def laplacian_of_gaussian(image: Tensor, *, fraction: float = 0.04) -> Tensor:
+def laplacian_of_gaussian(image: Tensor, fraction: float) -> Tensor:
     """Zero crossings of the Laplacian of the image smoothed by 2 px (Marr and Hildreth 1980).
 
     A pixel is a crossing where the sign of the Laplacian differs from that of the right or the
@@ -85,7 +82,7 @@ def laplacian_of_gaussian(image: Tensor, *, fraction: float = 0.04) -> Tensor:
 
 
 @detector
-def canny(image: Tensor, *, fraction: float = 0.04) -> Tensor:
+def canny(image: Tensor, fraction: float) -> Tensor:
     """Canny (1986) by scikit-image, sigma 1.4 px; as in MATLAB's ``edge``, 30 % of the pixels
     exceed the upper threshold, and the lower one is 0.4 times as high."""
     gradient = spatial_gradient(smooth(image, 1.4, margin=0))[:, 0]
@@ -102,11 +99,11 @@ def canny(image: Tensor, *, fraction: float = 0.04) -> Tensor:
 
 
 @detector
-def fuzzy_edges(image: Tensor, *, width: float = 0.1, fraction: float = 0.04) -> Tensor:
+def fuzzy_edges(image: Tensor, fraction: float) -> Tensor:
     r"""Edges by fuzzy rules on the two derivatives, each divided by the largest derivative of the
     image.
 
-    With "zero" as :math:`\mu(g) = \exp(-g^2 / (2\,\mathrm{width}^2))` and AND as min, a pixel is
+    With "zero" as :math:`\mu(g) = \exp(-g^2 / (2 \cdot 0.1^2))` and AND as min, a pixel is
     uniform (0) if I_x is zero and I_y is zero, and an edge (1) otherwise. Points are the maxima
     along the gradient of the mean of 0 and 1 weighted by the truth of each rule (Sugeno),
     :math:`1 - \min(\mu(I_x), \mu(I_y))`.
@@ -114,7 +111,7 @@ def fuzzy_edges(image: Tensor, *, width: float = 0.1, fraction: float = 0.04) ->
     gradient = image_gradient(image, sigma=1.0)
     peak = image_maximum(gradient.abs())
     relative = gradient / torch.where(peak > 0, peak, 1.0)
-    zero = torch.exp(-0.5 * (relative / width).square()).amin(dim=1, keepdim=True)
+    zero = torch.exp(-0.5 * (relative / 0.1).square()).amin(dim=1, keepdim=True)
     length = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
     edges = (1.0 - zero) * gradient / torch.where(length > 0, length, 1.0)
     return field_points(edges, fraction=fraction)
@@ -126,11 +123,11 @@ SIDES = (9, 15, 21, 27, 39, 51, 75, 99)
 
 
 @detector
-def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.04) -> Tensor:
+def fast_hessian(image: Tensor, fraction: float) -> Tensor:
     """Fast-Hessian (Bay et al. 2008), the detector of SURF: determinants of a Hessian of box
     filters by scikit-image.
 
-    Points are maxima above ``threshold`` > 0 over 3 x 3 px and three neighbouring sides.
+    Points are maxima above 1e-4 over 3 x 3 px and three neighbouring sides.
     """
     H, W = image.shape[-2:]
     sides = [side for side in SIDES if side <= max(21, H, W)]
@@ -141,26 +138,26 @@ def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.
     volume = volume[..., 49 : 49 + H, 49 : 49 + W]
     inner = volume[:, :, 1:-1]
     largest = F.max_pool3d(volume, 3, stride=1, padding=(0, 1, 1))
-    best = torch.where((inner == largest) & (inner > threshold), inner, 0.0).amax(dim=2)
+    best = torch.where((inner == largest) & (inner > 1e-4), inner, 0.0).amax(dim=2)
     return strongest_points(best, best > 0, fraction)
 
 
 @detector
-def harris(image: Tensor, *, k: float = 0.04, fraction: float = 0.04) -> Tensor:
-    """Harris and Stephens (1988): det - k trace^2 of the structure tensor (Sobel, Gaussian window),
-    where positive."""
-    return peaks(harris_response(image, k=k), fraction)
+def harris(image: Tensor, fraction: float) -> Tensor:
+    """Harris and Stephens (1988): det - 0.04 trace^2 of the structure tensor (Sobel, Gaussian
+    window), where positive."""
+    return peaks(harris_response(image, k=0.04), fraction)
 
 
 @detector
-def minimum_eigenvalue(image: Tensor, *, fraction: float = 0.04) -> Tensor:
+def minimum_eigenvalue(image: Tensor, fraction: float) -> Tensor:
     """Shi and Tomasi (1994): the smaller eigenvalue of the structure tensor (Sobel, Gaussian
     window)."""
     return peaks(gftt_response(image), fraction)
 
 
 @detector
-def sift(image: Tensor, *, fraction: float = 0.04) -> Tensor:
+def sift(image: Tensor, fraction: float) -> Tensor:
     """SIFT keypoints (Lowe 2004) by OpenCV with its defaults on the CPU, each rounded to the
     nearest pixel."""
     points = torch.zeros(image.shape, dtype=torch.bool)
@@ -175,12 +172,12 @@ def sift(image: Tensor, *, fraction: float = 0.04) -> Tensor:
     return points
 
 
-def of_field(field: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
+def of_field(field: Callable[[Tensor], Tensor]) -> Detector:
     """The detector of a filter of the library."""
-    return detector(lambda image, fraction=0.04: field_points(field(image), fraction=fraction))
+    return detector(lambda image, fraction: field_points(field(image), fraction=fraction))
 
 
-DETECTORS: dict[str, Callable[..., Tensor]] = {
+DETECTORS: dict[str, Detector] = {
     "mfc": of_field(FIELDS["MFC"]()),
     "mfc x cs": of_field(multiscale_focus_curves),
     "mcs": of_field(multiscale_curvilinear_saliency),

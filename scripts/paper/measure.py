@@ -92,7 +92,7 @@ def sized(pipeline: Pipeline, settings: BankSettings) -> Pipeline:
 
 def detected(crop: Tensor, share: float) -> dict[str, Tensor]:
     """Points (H, W) bool of every detector in a crop (1, 1, H, W), by name in capitals."""
-    return {name.upper(): detect(crop, fraction=share)[0, 0] for name, detect in DETECTORS.items()}
+    return {name.upper(): detect(crop, share)[0, 0] for name, detect in DETECTORS.items()}
 
 
 @torch.no_grad()

@@ -190,7 +190,6 @@ def main() -> int:
     parser = parser_of(__doc__)
     parser.add_argument("--damaged", type=int, default=200)
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=RESULTS / "wrong_inputs.json")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(options.jobs) as pool:
         folder = Path(temporary)
@@ -207,7 +206,7 @@ def main() -> int:
     failures = [found for found in answers if "failure" in found]
     record = stamp() | {"cases": len(wrong), "damaged": len(lines)}
     record |= {"codes": Counter(str(found["code"]) for found in answers), "failures": failures}
-    write_json(options.out, record)
+    write_json(RESULTS / "wrong_inputs.json", record)
     print(json.dumps(record, indent=2))
     return 1 if failures else 0
 

@@ -116,9 +116,10 @@ def _draw_shape(picture: Array, rng: Rng) -> None:
         cv2.ellipse(picture, place, axes, angle, 0, 360, colour, -1, cv2.LINE_AA)
 
 
-def random_texture(rng: Rng, size: int = 256) -> Array:
-    """(size, size, 3) float32 linear colours that repeat: wooden boards, woven cloth, or a random
+def random_texture(rng: Rng) -> Array:
+    """(256, 256, 3) float32 linear colours that repeat: wooden boards, woven cloth, or a random
     picture."""
+    size = 256
     kind = rng.integers(3)
     if kind == 0:
         return random_picture(rng, size)

@@ -100,7 +100,7 @@ def carton(rng: Rng) -> tuple[np.ndarray, ...]:
     return corners.reshape(-1, 3), faces, uv.reshape(-1, 2)
 
 
-def package(rng: Rng, print_rng: Rng | None = None) -> TexturedMesh:
+def package(rng: Rng, print_rng: Rng | None) -> TexturedMesh:
     """A printed package, 8 to 25 cm high, in metres; with another print if ``print_rng`` is
     given."""
     vertices, faces, uv = carton(rng) if rng.random() < 0.3 else solid_of_revolution(rng)

@@ -62,8 +62,8 @@ def single(
     textures: Callable[[Rng], Array],
     rng: Rng,
     *,
-    upright: bool = True,
-    occluded: bool = False,
+    upright: bool,
+    occluded: bool,
     cameras: int = 1,
 ) -> Scene:
     """One object of radius 1 on the floor of a room, with up to five others around it, and one in
@@ -107,8 +107,8 @@ def shelf(
     textures: Callable[[Rng], Array],
     rng: Rng,
     *,
-    occlusion: float = 0.6,
-    cameras: int = 1,
+    occlusion: float,
+    cameras: int,
 ) -> Scene:
     """Objects side by side on one or two boards, two deep: the front row hides up to ``occlusion``
     of the back row."""
