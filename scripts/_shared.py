@@ -7,13 +7,16 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
+
+from curvireg_torch.errors import WorkerError
+from curvireg_torch.utils.executors import Workers
+from curvireg_torch.utils.files import write_file
 
 if TYPE_CHECKING:
     import resource
@@ -53,25 +56,60 @@ def read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def write_json(path: Path, content: Any, indent: int = 2) -> None:
+def write_json(path: Path, content: Any) -> None:
     """Write a record, and create its folder if needed; an interrupted run leaves no half of a
     file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.{os.getpid()}")
-    part.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
-    part.replace(path)
+    write_file(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def read_lines(path: Path) -> list[Any]:
+    """JSON lines."""
+    return list(map(json.loads, path.read_text(encoding="utf-8").splitlines()))
 
 
 def in_processes(
     function: Callable[[Any], Any],
-    tasks: Sequence[Any],
+    tasks: Collection[Any],
     jobs: int,
     name: str,
-    **options: Any,
-) -> Iterator[Any]:
-    """Results of tasks in their order, with a bar; ``options`` are those of the processes."""
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), **options) as pool:
-        yield from tqdm(pool.map(function, tasks), total=len(tasks), desc=name)
+) -> Iterator[tuple[Any, Any]]:
+    """Tasks and their results as they are done, with a bar; each process gets the function once."""
+    with Workers(jobs) as workers:
+        done = workers.map(_each, function, ([task] for task in tasks))
+        for task, found in tqdm(done, total=len(tasks), desc=name):
+            if isinstance(found, WorkerError):
+                raise found
+            yield task, found
+
+
+def _each(function: Callable[[Any], Any], tasks: Sequence[Any]) -> list[Any]:
+    return list(map(function, tasks))
+
+
+def measured(
+    out: Path,
+    function: Callable[[Any], list[Any]],
+    tasks: Mapping[str, Any],
+    jobs: int,
+    name: str,
+) -> list[Any]:
+    """Rows of tasks, by what they depend on; those of finished tasks are kept in a file, and read
+    from it."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    known = {}
+    if out.exists():
+        known = {str(entry["task"]): entry["rows"] for entry in read_lines(out)}
+    new = {key: task for key, task in tasks.items() if key not in known}
+    with out.open("a", encoding="utf-8") as file:
+        for (key, _), rows in in_processes(partial(_of_item, function), new.items(), jobs, name):
+            known[key] = rows
+            file.write(json.dumps({"task": key, "rows": rows}) + "\n")
+            file.flush()
+    return [row for key in tasks for row in known[key]]
+
+
+def _of_item(function: Callable[[Any], Any], item: tuple[str, Any]) -> Any:
+    return function(item[1])
 
 
 def stamp() -> dict[str, Any]:

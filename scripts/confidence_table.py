@@ -9,7 +9,6 @@ table is written from it.
 """
 
 import csv
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -23,6 +22,7 @@ from scripts._shared import (
     markdown_table,
     parser_of,
     read_json,
+    read_lines,
     stamp,
     update_page,
     write_json,
@@ -62,8 +62,7 @@ def merged(
 def measured(run: Path) -> dict[str, Any]:
     """What the confidences of one run are worth; objects without a pose count as wrong, with
     confidence 0."""
-    lines = (run / "results.jsonl").read_text(encoding="utf-8").splitlines()
-    results = {row["key"]: row for row in map(json.loads, lines)}
+    results = {row["key"]: row for row in read_lines(run / "results.jsonl")}
     with (run / "errors.csv").open(encoding="utf-8", newline="") as file:
         errors = list(csv.DictReader(file))
     column = next(name for name in ERROR_COLUMNS if name in errors[0])

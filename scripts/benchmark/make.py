@@ -22,7 +22,7 @@ import shutil
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -392,6 +392,8 @@ def lone_object(
 
 def make_scene(objects: Packages, options: Namespace, index: int) -> None:
     """Write scene ``index`` unless it exists."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
     folder = options.out / "test" / f"{index:06d}"
     if folder.exists():
         return
@@ -497,26 +499,6 @@ def write_targets(options: Namespace) -> int:
     return len(targets)
 
 
-_state: list[Any] = []
-
-
-def _start(options: Namespace) -> None:
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    shapes = Variants if options.cad == "variant" else Shapes
-    kinds = {"furniture": Furniture, "shapes": shapes, "tied": Tied}
-    _state[:] = [kinds.get(options.kind, Packages)(options), options]
-
-
-def _one(index: int) -> None:
-    make_scene(*_state, index)
-
-
-def _model(obj_id: int) -> dict[str, Any]:
-    objects, options = _state
-    return model_row(objects, options.out / "models", obj_id)
-
-
 def arguments() -> ArgumentParser:
     parser = parser_of(__doc__)
     parser.add_argument("--kind", choices=KINDS, default="printed")
@@ -554,16 +536,17 @@ def arguments() -> ArgumentParser:
 
 def main() -> None:
     options = arguments().parse_args()
-    _start(options)
-    objects = _state[0]
+    shapes = Variants if options.cad == "variant" else Shapes
+    kinds = {"furniture": Furniture, "shapes": shapes, "tied": Tied}
+    objects = kinds.get(options.kind, Packages)(options)
     (options.out / "test").mkdir(parents=True, exist_ok=True)
     models = options.out / "models"
     models.mkdir(exist_ok=True)
     ids = objects.written
-    start = {"initializer": _start, "initargs": (options,)}
-    rows = in_processes(_model, ids, options.jobs, "models", **start)
-    write_json(models / "models_info.json", dict(zip(ids, rows, strict=True)))
-    list(in_processes(_one, range(options.count), options.jobs, "scenes", **start))
+    rows = dict(in_processes(partial(model_row, objects, models), ids, options.jobs, "models"))
+    write_json(models / "models_info.json", {obj_id: rows[obj_id] for obj_id in ids})
+    scene = partial(make_scene, objects, options)
+    list(in_processes(scene, range(options.count), options.jobs, "scenes"))
     kept = {name: value for name, value in vars(options).items() if name not in ("out", "jobs")}
     kept["meshes"] = options.meshes and str(options.meshes)
     kept["groups"] = {obj_id: objects.group(obj_id % TWIN) for obj_id in ids}

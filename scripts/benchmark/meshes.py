@@ -16,7 +16,6 @@ import re
 import subprocess
 import sys
 import zipfile
-from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -145,15 +144,7 @@ def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
 def candidate_rotations() -> np.ndarray:
     """(32, 3, 3) possible symmetries: the 24 rotations of a cube, identity first, and steps of 30
     degrees about z."""
-    x, y, z = np.meshgrid([1.0, -1.0], [1.0, -1.0], [1.0, -1.0])
-    signs = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    cube = []
-    for order in permutations(range(3)):
-        for sign in signs:
-            R = np.diag(sign) @ np.eye(3)[list(order)]
-            if np.linalg.det(R) > 0:
-                cube.append(R)
-    cube.sort(key=lambda R: -np.trace(R))
+    cube = sorted(Rotation.create_group("O").as_matrix().round(), key=lambda R: -np.trace(R))
     steps = [30 * k for k in range(1, 12) if k % 3]
     about_z = Rotation.from_euler("z", np.array(steps)[:, None], degrees=True)
     return np.concatenate([cube, about_z.as_matrix()])
@@ -257,7 +248,8 @@ def main() -> None:
     meshes = []
     left_out = {}
     clouds = {}
-    for row, why, cloud in in_processes(examine, tasks, arguments.jobs, "meshes"):
+    examined = [found for _, found in in_processes(examine, tasks, arguments.jobs, "meshes")]
+    for row, why, cloud in sorted(examined, key=lambda found: found[0]["id"]):
         if why is not None:
             left_out[row["id"]] = why
             continue

@@ -1,12 +1,11 @@
 """What registrations, refinements, trackers and detections say of generated photographs, and
 whether it is true: a row for each."""
 
-import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -22,11 +21,10 @@ from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
 from curvireg_torch.mesh import Mesh
 from curvireg_torch.registration import Follower, judging
 from curvireg_torch.registration.confidence import are_near
-from scripts._shared import in_processes, read_json
+from scripts._shared import measured, read_json
 from scripts.calibration.sets import photographs_of, set_of
 
 Row: TypeAlias = dict[str, Any]
-Task = TypeVar("Task")
 
 RIGHT = 30.0  # degrees within which a registration is right
 # and fraction of the distance, within which a refined or tracked pose is right
@@ -231,7 +229,6 @@ def rows_of(work: Path, kind: str, jobs: int) -> list[Row]:
     """Rows of a set, or of refinements and detections in the set "shapes"; finished meshes are read
     from the file."""
     folder = work / photographs_of(kind)
-    out = work / f"{kind}.jsonl"
     data = BOPDataset(folder)
     annotations = [data.annotation(i) for i in range(len(data))]
     listed = [(int(s["scene_id"]), int(s["obj_id"]), i) for i, s in enumerate(annotations)]
@@ -241,33 +238,10 @@ def rows_of(work: Path, kind: str, jobs: int) -> list[Row]:
         upright = set_of(kind).upright and entry[0] % 2 == 0
         return entry[1], int(not upright)
 
-    tasks = []
+    tasks = {}
     for key, group in groupby(sorted(listed, key=mesh_and_pose), key=mesh_and_pose):
         indices = [i for _, _, i in group]
         scenes = {scene for scene, obj_id, _ in listed if obj_id == key[0]}
         beside = next((i for scene, _, i in listed if scene not in scenes), 0)
-        tasks.append((key, (kind, folder, "any" if key[1] else "upright", indices, beside)))
-    return measured(out, tasks, measure, jobs, kind)
-
-
-def measured(
-    out: Path,
-    tasks: Sequence[tuple[Any, Task]],
-    measure_one: Callable[[Task], list[Row]],
-    jobs: int,
-    name: str,
-) -> list[Row]:
-    """Rows of tasks with keys, and of those that a file holds; finished ones are kept in it."""
-    known = {}
-    if out.exists():
-        for line in out.read_text().splitlines():
-            entry = json.loads(line)
-            known[json.dumps(entry["task"])] = entry["rows"]
-    new = [(key, task) for key, task in tasks if json.dumps(key) not in known]
-    with out.open("a") as file:
-        results = in_processes(measure_one, [task for _, task in new], jobs, name)
-        for (key, _), rows in zip(new, results, strict=True):
-            known[json.dumps(key)] = rows
-            file.write(json.dumps({"task": key, "rows": rows}) + "\n")
-            file.flush()
-    return [row for rows in known.values() for row in rows]
+        tasks[str(list(key))] = (kind, folder, "any" if key[1] else "upright", indices, beside)
+    return measured(work / f"{kind}.jsonl", measure, tasks, jobs, kind)

@@ -38,12 +38,11 @@ from torch import Tensor
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.registration.confidence import RELIABLE
-from scripts._shared import RESULTS, parser_of, read_json, stamp, write_json
+from scripts._shared import RESULTS, measured, parser_of, read_json, stamp, write_json
 from scripts.benchmark.make import TWIN, Variants
 from scripts.calibration.measure import (
     Row,
     errors_of,
-    measured,
     mesh_of,
     symmetries_of,
     true_centre,
@@ -280,12 +279,12 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", choices=SOURCES, default=list(SOURCES))
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
-    tasks = []
+    tasks = {}
     for name in options.sets:
         for folder, kinds, indices in tasks_of(options.work, name, options.each):
-            tasks.append(([folder.name, kinds, indices], (folder, kinds, indices)))
+            tasks[str([name, kinds, indices])] = (folder, kinds, indices)
     out = options.work / "misleading.jsonl"
-    rows = measured(out, tasks, measure, options.jobs, "misleading")
+    rows = measured(out, measure, tasks, options.jobs, "misleading")
     misleading = [row for row in rows if row["kind"] != "ordinary"]
     record = stamp() | {"misleading": table_of(misleading), "kinds": {}}
     for kind, way in sorted({(row["kind"], row["way"]) for row in rows}):

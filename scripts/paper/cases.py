@@ -73,11 +73,11 @@ class Case:
         return self.camera is not None and bool(self.pose[:, 3].isfinite().all())
 
 
-def find_cases(kind: str, root: Path, *, limit: int | None = None) -> list[Case]:
+def find_cases(kind: str, root: Path) -> list[Case]:
     """The objects that the paper uses: neither occluded nor truncated, with known pose; grouped by
     mesh.
 
-    ``kind`` is "pascal3d", "bop" or "web"; ``limit`` uses only this many, spread evenly.
+    ``kind`` is "pascal3d", "bop" or "web".
     """
     row = DATASETS[kind]
     dataset = row.open(root, **row.whole)
@@ -85,8 +85,6 @@ def find_cases(kind: str, root: Path, *, limit: int | None = None) -> list[Case]
     cases = [case for case in found if case is not None]
     if not cases:
         raise InvalidInputError(f"{root}: holds no whole object with a known pose")
-    if limit is not None and limit < len(cases):
-        cases = [cases[i * len(cases) // limit] for i in range(limit)]
     return sorted(cases, key=lambda case: case.mesh_path)
 
 

@@ -21,9 +21,9 @@ TABLE is one of
 - all
 
 Every table states what was measured, the number of photographs, and 95 % intervals. Only objects
-that are neither occluded nor truncated are used, as in the paper. DIR/records holds one file for
-each mesh: an interrupted run goes on where it was. --page writes all tables that DIR holds, with
-the commit, into a page.
+that are neither occluded nor truncated are used, as in the paper. DIR/records.jsonl holds a line
+for each mesh: an interrupted run goes on where it was. --page writes all tables that DIR holds,
+with the commit, into a page.
 """
 
 import argparse
@@ -31,24 +31,21 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
 sys.path.insert(0, str(REPOSITORY))
 
-from curvireg_torch.errors import CurviregError, MissingDependencyError, WorkerError
+from curvireg_torch.errors import CurviregError, MissingDependencyError
 from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.jobs.runner import results_digest
-from curvireg_torch.jobs.store import finite
 from curvireg_torch.pipeline import BankSettings
-from curvireg_torch.utils.executors import Workers
 from curvireg_torch.utils.files import file_digest, text_digest, write_file
-from scripts._shared import commit, parser_of, read_json, update_page, write_json
+from scripts._shared import commit, measured, parser_of, read_lines, update_page
 from scripts.paper import tables as paper
 from scripts.paper.cases import Case, by_mesh, find_cases
 
@@ -76,21 +73,15 @@ ON_PAGE += ("precision_classes", "ranks", "grids", "angles", "search")
 BLOCKS = {"protocols": ("protocols", "thresholds"), "paper": ON_PAGE}
 """Tables between each pair of markers of the page; one that a folder has none of stays."""
 
+RECORDS = "records.jsonl"
 CURVE = "paper-curve.webp"
 
 
-def measure_groups(
-    state: tuple[str, BankSettings, str], tasks: Sequence[tuple[Path, list[Case]]]
-) -> list[list[dict[str, Any]]]:
-    """Records of the cases of each mesh."""
-    return [measure(cases, *state) for _, cases in tasks]
-
-
 def measure(
-    cases: list[Case],
     phase: str,
     settings: BankSettings,
     pose: str,
+    cases: list[Case],
 ) -> list[dict[str, Any]]:
     """Records of the cases of one mesh."""
     from scripts.paper.measure import MEASURES
@@ -107,14 +98,18 @@ def measure(
 
 def run(arguments: argparse.Namespace) -> None:
     check_packages()
-    cases = find_cases(arguments.kind, arguments.root, limit=arguments.limit)
+    cases = find_cases(arguments.kind, arguments.root)
     settings = BankSettings(image_size=arguments.image_size)
     what = f"{arguments.root.name}, crops of {settings.image_size} px"
     for phase, makers in PHASES.items():
         chosen = [name for name in makers if arguments.table in ("all", name)]
         if not chosen:
             continue
-        records = paper.Records(collect(phase, cases, settings, arguments), what)
+        state = (phase, settings, DATASETS[arguments.kind].pose)
+        groups = {request_of(*state, group): group for group in by_mesh(cases)}
+        measure_group = partial(measure, *state)
+        found = measured(arguments.out / RECORDS, measure_group, groups, arguments.jobs, phase)
+        records = paper.Records(found, what)
         for name in chosen:
             for table in makers[name](records):
                 text = table.markdown()
@@ -126,36 +121,11 @@ def run(arguments: argparse.Namespace) -> None:
         write_page(arguments.out, arguments.page)
 
 
-def collect(
-    phase: str,
-    cases: list[Case],
-    settings: BankSettings,
-    arguments: argparse.Namespace,
-) -> list[dict[str, Any]]:
-    """The records of all cases; those of each mesh are stored when they are known."""
-    state = (phase, settings, DATASETS[arguments.kind].pose)
-    groups = {}
-    for group in by_mesh(cases):
-        path = arguments.out / "records" / f"{phase}-{request_of(group, *state)}.json"
-        groups[path] = group
-    missing = [(path, group) for path, group in groups.items() if not path.exists()]
-    done = len(cases) - sum(len(group) for _, group in missing)
-    bar = tqdm(total=len(cases), initial=done, desc=phase, unit="photo")
-    with bar, Workers(arguments.jobs) as workers:
-        blocks = ([task] for task in missing)
-        for (path, group), found in workers.map(measure_groups, state, blocks):
-            if isinstance(found, WorkerError):
-                raise found
-            write_json(path, finite(found), indent=0)
-            bar.update(len(group))
-    return [record for path in groups for record in read_json(path)]
-
-
 def request_of(
-    group: list[Case],
     phase: str,
     settings: BankSettings,
     pose: str,
+    group: list[Case],
 ) -> str:
     """Digest of all that the records of a mesh depend on."""
     own = [
@@ -200,8 +170,8 @@ def draw_curve(records: paper.Records, path: Path) -> None:
 
 def write_page(folder: Path, page: Path) -> None:
     """Replace the parts of a page between its markers by the tables of a folder."""
-    records = [read_json(path) for path in (folder / "records").iterdir()]
-    commits = sorted({record["commit"] for some in records for record in some})
+    entries = read_lines(folder / RECORDS)
+    commits = sorted({record["commit"] for entry in entries for record in entry["rows"]})
     for block, names in BLOCKS.items():
         paths = [folder / f"{name}.md" for name in names]
         found = [path.read_text(encoding="utf-8") for path in paths if path.exists()]
@@ -221,9 +191,6 @@ def main() -> int:
     parser.add_argument("kind", choices=DATASETS)
     parser.add_argument("root", type=Path, metavar="ROOT")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument(
-        "--limit", type=int, metavar="N", help="use N photographs, spread evenly over the set"
-    )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
     parser.add_argument(
         "--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)"

@@ -1,6 +1,5 @@
 """The paper's tables, made of the records of :mod:`scripts.paper.measure`."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -124,23 +123,13 @@ def beside_the_paper(
 
 
 def at(*keys: str | int) -> Value:
-    """The number of a record under these keys, one within the other; NaN where it holds None, as
-    for what is not finite."""
-
-    def value(record: dict[str, Any]) -> float:
-        found = reduce(getitem, keys, record)
-        return math.nan if found is None else float(found)
-
-    return value
+    """The number of a record under these keys, one within the other."""
+    return lambda record: float(reduce(getitem, keys, record))
 
 
 def right_at(*keys: str | int | slice) -> Value:
     """Whether the error under these keys is small; of several errors, any."""
-
-    def value(record: dict[str, Any]) -> float:
-        return float(np.min(reduce(getitem, keys, record)) < RIGHT_DEG)
-
-    return value
+    return lambda record: float(np.min(reduce(getitem, keys, record)) < RIGHT_DEG)
 
 
 def _printed(number: float | None, digits: int = 2) -> str:

@@ -1,8 +1,8 @@
-import json
+from copy import deepcopy
 
 import pytest
 
-from scripts._shared import REPOSITORY, RESULTS
+from scripts._shared import REPOSITORY, RESULTS, read_json
 from scripts.confidence_table import (
     GENERATED,
     generated_part,
@@ -13,6 +13,7 @@ from scripts.confidence_table import (
     table_of_withheld,
 )
 
+PAGE = REPOSITORY / "docs" / "accuracy.md"
 ROWS = """\
 {"key": "a", "confidence": 0.95, "reliable": true, "ambiguous": null}
 {"key": "b", "confidence": 0.97, "reliable": true, "ambiguous": "several"}
@@ -54,18 +55,16 @@ def test_one_kind_of_answers_has_no_order(tmp_path):
 
 
 def test_the_page_shows_the_confidences_of_the_calibration():
-    record = json.loads((RESULTS / "calibration.json").read_text(encoding="utf-8"))
+    record = read_json(RESULTS / "calibration.json")
     sets = record["held out"]["instance"]["sets"]
     assert set(GENERATED) == set(sets)
-    assert generated_part(record) in (REPOSITORY / "docs" / "accuracy.md").read_text(
-        encoding="utf-8"
-    )
+    assert generated_part(record) in PAGE.read_text("utf-8")
     quality = record["held out"]["instance"]
     sentence, lines, covered = generated_part(record).split("\n\n")
     assert sentence.startswith(f"Fitted on {quality['n']} generated photographs")
     assert lines == table_of_generated(sets).strip()
     assert covered.startswith(f"Of {quality['covariances']} right and reliable answers")
-    half = json.loads(json.dumps(record))
+    half = deepcopy(record)
     half["constants"]["covariance_scale"] = 2.0 * quality["covariance_scale"]
     assert "with 0.50 times the variance, 0.90 would." in generated_part(half)
     few = {"n": 7, "said": 0.126, "right": 0.0, "reliable": 0.5, "reliable and wrong": 3}
@@ -74,9 +73,9 @@ def test_the_page_shows_the_confidences_of_the_calibration():
 
 
 def test_photographs_with_and_without_cameras_stand_side_by_side():
-    record = json.loads((RESULTS / "calibration.json").read_text(encoding="utf-8"))
+    record = read_json(RESULTS / "calibration.json")
     sets = record["held out"]["instance"]["sets"]
-    assert table_of_withheld(sets) in (REPOSITORY / "docs" / "accuracy.md").read_text("utf-8")
+    assert table_of_withheld(sets) in PAGE.read_text("utf-8")
     given = {"n": 3, "within 5": 0.25, "within 15": 0.75, "median": 4.04}
     none = {"n": 3, "within 5": 0.125, "within 15": 0.5, "median": 9.96}
     changed = sets | {"packages": given, "estimated_packages": none}

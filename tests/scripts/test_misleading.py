@@ -1,7 +1,6 @@
 """Photographs that mislead, by their known changes."""
 
 from argparse import Namespace
-from concurrent.futures import ThreadPoolExecutor
 from math import radians
 from types import SimpleNamespace
 
@@ -11,8 +10,8 @@ import torch
 
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.registration.result import Axis
+from scripts._shared import measured
 from scripts.benchmark.make import PART_AREA, TWIN, Variants
-from scripts.calibration.measure import measured
 from scripts.calibration.misleading import (
     BARREL,
     CROPPED,
@@ -180,16 +179,15 @@ def test_axes_are_right_within_their_tolerance():
     assert not axis_is_right(SimpleNamespace(axis=None), SimpleNamespace(round_axis=None), None)
 
 
-def test_finished_tasks_are_kept(tmp_path, monkeypatch):
-    processes = "scripts._shared.ProcessPoolExecutor"
-    monkeypatch.setattr(processes, lambda jobs, **_: ThreadPoolExecutor(jobs))
+def test_finished_tasks_are_kept(tmp_path):
     out = tmp_path / "rows.jsonl"
-    tasks = [([k, "a"], k) for k in (1, 2)]
-    assert measured(out, tasks, doubled, 1, "") == [{"value": 2}, {"value": 4}]
-    assert measured(out, [([3, "a"], 3), *tasks], failing_beyond_two, 1, "") == [
+    tasks = {f"[{k}, 'a']": k for k in (1, 2)}
+    assert measured(out, doubled, tasks, 1, "") == [{"value": 2}, {"value": 4}]
+    more = {"[3, 'a']": 3, **tasks}
+    assert measured(out, failing_beyond_two, more, 1, "") == [
+        {"value": 6},
         {"value": 2},
         {"value": 4},
-        {"value": 6},
     ]
 
 

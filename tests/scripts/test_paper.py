@@ -1,6 +1,5 @@
 """The paper's measurements on rendered photographs, for which the true view must win."""
 
-import json
 import math
 import re
 import subprocess
@@ -19,7 +18,7 @@ import torch
 from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from scripts._shared import commit, read_json
+from scripts._shared import commit, read_json, read_lines
 from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
@@ -272,8 +271,8 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     assert "N = 2 (1 CADs)" in text
     assert text in page.read_text()
     assert f"Measured at commit {commit()}." in page.read_text()
-    (record,) = (tmp_path / "records").iterdir()
-    assert len(json.loads(record.read_text())) == 2
+    (entry,) = read_lines(tmp_path / reproduce_paper.RECORDS)
+    assert len(entry["rows"]) == 2
     monkeypatch.setattr(
         reproduce_paper, "measure", Mock(side_effect=AssertionError("measured again"))
     )
