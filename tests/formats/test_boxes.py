@@ -221,18 +221,23 @@ def test_two_images_that_may_be_the_photograph_are_refused(boxes_json):
         box_of(file, "cam1/a.tif")
 
 
-@pytest.mark.parametrize(
-    ("annotated", "orientation", "shown"),
-    [
-        ((48, 64), 1, (48, 64)),
-        ((24, 32), 1, (48, 64)),
-        ((96, 128), 1, (48, 64)),
-        *(((48, 64), number, (64, 48)) for number in range(5, 9)),
-        ((96, 128), 6, (64, 48)),
-        ((64, 48), 6, (64, 48)),  # of a tool that turns pictures, as ours
-    ],
-)
-def test_boxes_of_pictures_of_another_size_or_not_turned(boxes_json, annotated, orientation, shown):
+PICTURES = """
+[48, 64]  | 1 | [48, 64] | the same
+[24, 32]  | 1 | [48, 64] | smaller
+[96, 128] | 1 | [48, 64] | larger
+[48, 64]  | 5 | [64, 48] | not turned
+[48, 64]  | 6 | [64, 48] | not turned
+[48, 64]  | 7 | [64, 48] | not turned
+[48, 64]  | 8 | [64, 48] | not turned
+[96, 128] | 6 | [64, 48] | larger and not turned
+[64, 48]  | 6 | [64, 48] | of a tool that turns pictures, as ours
+"""
+
+
+@pytest.mark.parametrize(("annotated", "orientation", "shown", "kind"), text_table(PICTURES))
+def test_boxes_of_pictures_of_another_size_or_not_turned(
+    boxes_json, annotated, orientation, shown, kind
+):
     """The box of some white pixels, in a picture of another size or orientation."""
     height, width = annotated
     is_stored = orientation > 4 and height < width
@@ -249,8 +254,8 @@ def test_boxes_of_pictures_of_another_size_or_not_turned(boxes_json, annotated, 
     file = boxes_json(content)
     rows, columns = seen[..., 0].nonzero()
     expected = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
-    found = box_of(file, "a.jpg", shown, orientation)
-    assert found == pytest.approx(tuple(value - 0.5 for value in map(float, expected)))
+    found = box_of(file, "a.jpg", tuple(shown), orientation)
+    assert found == pytest.approx(tuple(value - 0.5 for value in map(float, expected))), kind
 
 
 def test_boxes_of_a_picture_of_other_proportions_are_refused(boxes_json):

@@ -7,6 +7,7 @@ from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import cad, usd
 from tests._support.meshes import load as load
 from tests._support.programs import run_here
+from tests._support.refusals import refused as refused_input
 from tests.formats.meshes.packages import threemf
 
 
@@ -33,6 +34,19 @@ def loaded(tmp_path):
 def read_3mf(tmp_path, load):
     """Write a 3MF file, and load it."""
     return lambda *content, **more: load(threemf(tmp_path / "a.3mf", *content, **more))
+
+
+@pytest.fixture
+def bounded(monkeypatch):
+    """Check that a mesh is refused in these words where a limit of a module is so low."""
+
+    def check(path, words, module, limit, value):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, limit, value)
+            with refused_input(words, MeshError):
+                cr.load_mesh(path)
+
+    return check
 
 
 @pytest.fixture

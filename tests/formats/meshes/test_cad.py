@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError, MissingDependencyError
-from curvireg_torch.formats.meshes import cad
+from curvireg_torch.formats.meshes import cad, limits
+from curvireg_torch.formats.meshes import threemf as reader
 from curvireg_torch.formats.meshes.files import mesh_files
 from curvireg_torch.utils import extras, programs
 from curvireg_torch.utils.extras import is_installed
@@ -77,17 +78,11 @@ def test_damaged_step_files_are_refused(refused, content):
 
 
 @needs("cascadio")
-def test_step_files_are_bounded_in_size_and_time(write, monkeypatch):
+def test_step_files_are_bounded_in_size_and_time(write, bounded):
     path = write("part.step", step_file((3.0, 2.0, 1.0), "mm"))
-    for name, value, match in (
-        ("MAX_CAD_BYTES", 99, "larger than 99 bytes"),
-        ("MAX_MESH_BYTES", 99, "more than 99 bytes"),
-        ("MAX_CAD_SECONDS", 0.001, "took more than 0.001 seconds"),
-    ):
-        monkeypatch.setattr(programs if name == "MAX_CAD_SECONDS" else cad, name, value)
-        with refused(match, MeshError):
-            cr.load_mesh(path)
-        monkeypatch.undo()
+    bounded(path, "larger than 99 bytes", cad, "MAX_CAD_BYTES", 99)
+    bounded(path, "more than 99 bytes", cad, "MAX_MESH_BYTES", 99)
+    bounded(path, "took more than 0.001 seconds", programs, "MAX_CAD_SECONDS", 0.001)
 
 
 @pytest.mark.parametrize(
@@ -336,7 +331,7 @@ def test_threemf_of_several_models(read_3mf):
     assert mesh.extents.tolist() == [30.0, 20.0, 10.0]
 
 
-def test_hostile_threemf_files_are_refused(tmp_path, monkeypatch):
+def test_hostile_threemf_files_are_refused(tmp_path, bounded):
     path = tmp_path / "a.3mf"
     circle = '<object id="1"><components><component objectid="1"/></components></object>'
     many = "".join(
@@ -364,9 +359,7 @@ def test_hostile_threemf_files_are_refused(tmp_path, monkeypatch):
         cr.load_mesh(path)
     threemf(path, solid(1) + " " * 1_000_000)
     assert path.stat().st_size < 10_000
-    monkeypatch.setattr("curvireg_torch.formats.meshes.threemf.MAX_MESH_BYTES", 500_000)
-    with refused("unpacks to more than 500,000 bytes", MeshError):
-        cr.load_mesh(path)
+    bounded(path, "unpacks to more than 500,000 bytes", reader, "MAX_MESH_BYTES", 500_000)
 
 
 ROBOT = """<robot name="arm"><material name="blue"><color rgba="0 0 1 1"/></material>
@@ -445,7 +438,7 @@ def test_meshes_of_a_package_are_found_from_its_folder_urdf(
         cr.load_mesh(path)
 
 
-def test_hostile_urdf_files_are_refused(tmp_path, monkeypatch):
+def test_hostile_urdf_files_are_refused(tmp_path, bounded):
     path = arm(tmp_path)
     text = path.read_text()
     joint = '<joint name="l" type="fixed"><parent link="ball"/><child link="base"/></joint></robot>'
@@ -462,6 +455,4 @@ def test_hostile_urdf_files_are_refused(tmp_path, monkeypatch):
         with refused(match, MeshError):
             cr.load_mesh(path)
     path.write_text(text)
-    monkeypatch.setattr("curvireg_torch.formats.meshes.limits.MAX_MESH_FACES", 20)
-    with refused("more than 20 faces", MeshError):
-        cr.load_mesh(path)
+    bounded(path, "more than 20 faces", limits, "MAX_MESH_FACES", 20)

@@ -195,16 +195,16 @@ def test_vertex_colours_are_multiplied_by_the_material(loaded, dtype, largest, f
     assert_allclose(found.corners, expected, atol=1.0)
 
 
-@pytest.mark.parametrize(
-    ("transform", "expected"),
-    [
-        ({}, [(0, 0), (1, 0), (0, 0.5)]),
-        ({"offset": [0.5, 0.25]}, [(0.5, 0.25), (1.5, 0.25), (0.5, 0.75)]),
-        ({"scale": [2, 3]}, [(0, 0), (2, 0), (0, 1.5)]),
-        ({"rotation": math.pi / 2, "offset": [1, 0]}, [(1, 0), (1, -1), (1.5, 0)]),
-        ({"rotation": math.pi / 2, "scale": [2, 1]}, [(0, 0), (0, -2), (0.5, 0)]),
-    ],
-)
+TRANSFORMS = """
+{}                                            | [[0, 0], [1, 0], [0, 0.5]]
+{"offset": [0.5, 0.25]}                       | [[0.5, 0.25], [1.5, 0.25], [0.5, 0.75]]
+{"scale": [2, 3]}                             | [[0, 0], [2, 0], [0, 1.5]]
+{"rotation": 1.57079632679, "offset": [1, 0]} | [[1, 0], [1, -1], [1.5, 0]]
+{"rotation": 1.57079632679, "scale": [2, 1]}  | [[0, 0], [0, -2], [0.5, 0]]
+"""
+
+
+@pytest.mark.parametrize(("transform", "expected"), text_table(TRANSFORMS))
 @pytest.mark.parametrize("said", ["extensionsRequired", "extensionsUsed"])
 def test_texture_coordinates_are_transformed(loaded, transform, expected, said):
     """In the file (0, 0) is the top left; here it is the bottom left."""

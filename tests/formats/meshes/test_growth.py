@@ -12,6 +12,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
+from curvireg_torch.formats import xml_files
 from curvireg_torch.formats.meshes import cad, colours, files, gltf, limits, source, threemf, usd
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, is_file_name
 from curvireg_torch.formats.xml_files import read_xml
@@ -49,7 +50,7 @@ def peak(path):
     return most
 
 
-def test_names_of_urdf_are_looked_for_by_a_bounded_number_of_ends(tmp_path, monkeypatch):
+def test_names_of_urdf_are_looked_for_by_a_bounded_number_of_ends(tmp_path, monkeypatch, bounded):
     counts = []
     for parts in (10, 20, 1000, 2000):
         mesh = mesh_of_robot(f"package://{'a/' * parts}b.stl")
@@ -61,9 +62,7 @@ def test_names_of_urdf_are_looked_for_by_a_bounded_number_of_ends(tmp_path, monk
     assert twice < 30
     visuals = [mesh_of_robot(f"package://{k}/b.stl") for k in range(60)]
     path = robot(tmp_path / "a.urdf", *visuals)
-    monkeypatch.setattr("curvireg_torch.formats.meshes.limits.MAX_MESH_PARTS", 50)
-    with refused("more than 50 parts", MeshError):
-        cr.load_mesh(path)
+    bounded(path, "more than 50 parts", limits, "MAX_MESH_PARTS", 50)
 
 
 def with_unused_vertices():
@@ -181,7 +180,7 @@ def test_joints_of_a_skin_are_placed_once(tmp_path, monkeypatch):
         cr.load_mesh(whole.write(tmp_path / "a.gltf"))
 
 
-def test_names_outside_of_the_folder_are_counted(tmp_path, monkeypatch):
+def test_names_outside_of_the_folder_are_counted(tmp_path, monkeypatch, bounded):
     path = tmp_path / "a.obj"
     triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     counts = []
@@ -190,9 +189,7 @@ def test_names_outside_of_the_folder_are_counted(tmp_path, monkeypatch):
         path.write_text(f"mtllib {names}\n{triangle}")
         counts.append(resolved(monkeypatch, path))
     assert counts[1] - counts[0] <= 100
-    monkeypatch.setattr(source, "MAX_MESH_PARTS", 199)
-    with refused("names more than 199 files", MeshError):
-        cr.load_mesh(path)
+    bounded(path, "names more than 199 files", source, "MAX_MESH_PARTS", 199)
 
 
 @pytest.mark.parametrize(
@@ -246,7 +243,9 @@ def test_a_texture_of_many_groups_is_unpacked_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(not is_installed("collada"), reason="collada is not installed")
-def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(tmp_path, write, monkeypatch):
+def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(
+    tmp_path, write, monkeypatch, bounded
+):
     write("label.png", PICTURE)
     path = tmp_path / "a.dae"
     text = collada()
@@ -264,14 +263,10 @@ def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(tmp_path, wri
     for more in (copies, '<instance_controller url="#c"/>' * 4):
         with_more = collada(more=more).replace("<library_nodes>", f"{skin}<library_nodes>")
         path.write_text(with_more)
-        monkeypatch.setattr(limits, "MAX_MESH_FACES", 4)
-        with refused("more than 4 faces", MeshError):
-            cr.load_mesh(path)
+        bounded(path, "more than 4 faces", limits, "MAX_MESH_FACES", 4)
         monkeypatch.setattr(limits, "MAX_MESH_FACES", 5)
         cad._check_copies(read_xml(with_more.encode()))
-    monkeypatch.setattr("curvireg_torch.formats.xml_files.MAX_XML_ELEMENTS", 20)
-    with refused("more than 20 elements of XML", MeshError):
-        cr.load_mesh(path)
+    bounded(path, "more than 20 elements of XML", xml_files, "MAX_XML_ELEMENTS", 20)
 
 
 def test_a_program_has_limits_of_time_and_memory(tmp_path, monkeypatch):
@@ -292,15 +287,14 @@ def test_a_program_has_limits_of_time_and_memory(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(not is_installed("cascadio"), reason="cascadio is not installed")
-def test_opencascade_has_a_limit_of_memory(tmp_path, write, monkeypatch):
-    write("a.step", step_file((3.0, 2.0, 1.0), "mm"))
-    monkeypatch.setattr(programs, "MAX_CAD_MEMORY", 1 << 28)
-    with refused(r"OpenCASCADE (needs more than|finds no shape)", MeshError):
-        cr.load_mesh(tmp_path / "a.step")
+def test_opencascade_has_a_limit_of_memory(write, bounded):
+    path = write("a.step", step_file((3.0, 2.0, 1.0), "mm"))
+    words = r"OpenCASCADE (needs more than|finds no shape)"
+    bounded(path, words, programs, "MAX_CAD_MEMORY", 1 << 28)
 
 
 @pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
-def test_usd_drops_unused_points_before_they_are_copied(write, monkeypatch):
+def test_usd_drops_unused_points_before_they_are_copied(write, bounded):
     points = ", ".join(["(9, 9, 9)"] * 1000 + ["(0, 0, 0)", "(1, 0, 0)", "(0, 1, 0)"])
     text = f"""#usda 1.0
 def Xform "a" (
@@ -326,6 +320,5 @@ def "b" (
     for key in ("0.", "1."):
         assert arrays[key + "points"].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
         assert arrays[key + "indices"].tolist() == [0, 1, 2]
-    monkeypatch.setattr(programs, "MAX_CAD_MEMORY", 1 << 27)
-    with refused(r"OpenUSD (needs more than|cannot read)", MeshError):
-        cr.load_mesh(path)
+    words = r"OpenUSD (needs more than|cannot read)"
+    bounded(path, words, programs, "MAX_CAD_MEMORY", 1 << 27)

@@ -15,6 +15,7 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import limits, polygons, source
 from curvireg_torch.mesh import mesh as mesh_module
+from tests._support.tables import text_table
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
 
@@ -71,52 +72,45 @@ def test_load_mesh_reads_the_valid_gltf_and_glb_and_refuses_damaged_glb(tmp_path
         refused(tmp_path / "a.glb", damaged, "cannot be read")
 
 
-def zeros(**changes):
-    """A triangle whose accessor is changed."""
-    return {
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", **changes}
-        ]
-    }
+CHANGES = """
+{"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}  | circle
+{"nodes": [{"children": [0], "mesh": 0}]}                     | circle
+{"nodes": [{"children": [1, 1]}, {"mesh": 0}]}                | child of several
+{"nodes": [{"children": [7], "mesh": 0}]}                     | missing
+{"nodes": [{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}}]} | gpu_instancing, which is not read; export without it
+{"bufferViews": [{"buffer": 0, "byteLength": 1000000000000}]} | claim more than
+{"bufferViews": [{"buffer": 0, "byteLength": 100}]}           | cannot be read
+{"buffers": [{"byteLength": 36}]}                             | cannot be read
+{"extensionsRequired": ["KHR_draco_mesh_compression"]}        | KHR_draco_mesh_compression.*export without it
+{"extensionsRequired": ["EXT_meshopt_compression"]}           | EXT_meshopt_compression.*export without it
+{"asset": {"version": "1.0"}}                                 | version 2
+{"meshes": 5}                                                 | valid glTF
+{"accessors": [{"componentType": 5126, "count": 30000000, "type": "VEC3"}]} | has no data
+"""  # noqa: E501
+ACCESSORS = """
+{"count": 1000000000}    | claim more than
+{"count": 1000000}       | cannot be read
+{"count": -3}            | "-3"
+{"sparse": {"count": 1}} | valid glTF
+"""
+WHOLE_ACCESSOR = tree()["accessors"][0]
 
 
-def required(name):
-    return {"extensionsRequired": [name]}
-
-
-INSTANCES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
-
-
-def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path):
-    for changes, match in (
-        ({"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "circle"),
-        ({"nodes": [{"children": [0], "mesh": 0}]}, "circle"),
-        ({"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "child of several"),
-        ({"nodes": [{"children": [7], "mesh": 0}]}, "missing"),
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        *text_table(CHANGES),
+        *(
+            ({"accessors": [{**WHOLE_ACCESSOR, **changes}]}, match)
+            for changes, match in text_table(ACCESSORS)
+        ),
         ({"nodes": [{"mesh": 0}] * 20_000}, "10,000 parts"),
-        (
-            {"nodes": [{"mesh": 0, "extensions": INSTANCES}]},
-            "gpu_instancing, which is not read; export without it",
-        ),
-        (zeros(count=10**9), "claim more than"),
-        (zeros(count=10**6), "cannot be read"),
-        (zeros(count=-3), "-3"),
-        (zeros(sparse={"count": 1}), "valid glTF"),
-        (
-            {"accessors": [{"componentType": 5126, "count": 30_000_000, "type": "VEC3"}]},
-            "has no data",
-        ),
-        ({"bufferViews": [{"buffer": 0, "byteLength": 10**12}]}, "claim more than"),
-        ({"bufferViews": [{"buffer": 0, "byteLength": 100}]}, "cannot be read"),
-        ({"buffers": [{"byteLength": 36}]}, "cannot be read"),
-        (required("KHR_draco_mesh_compression"), "KHR_draco_mesh_compression.*export without it"),
-        (required("EXT_meshopt_compression"), "EXT_meshopt_compression.*export without it"),
-        ({"asset": {"version": "1.0"}}, "version 2"),
-        ({"meshes": 5}, "valid glTF"),
-    ):
-        refused(tmp_path / "a.gltf", json.dumps(tree(**changes)).encode(), match)
-        if "buffers" not in changes:
-            refused(tmp_path / "a.glb", glb(tree(**changes)), match)
+    ],
+)
+def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path, changes, match):
+    refused(tmp_path / "a.gltf", json.dumps(tree(**changes)).encode(), match)
+    if "buffers" not in changes:
+        refused(tmp_path / "a.glb", glb(tree(**changes)), match)
 
 
 OUTSIDE = [

@@ -250,16 +250,10 @@ def test_other_parts_are_named(write, load):
     assert any("no meshes are left out (Cube)" in text for text in texts)
 
 
-def test_bounds(write, monkeypatch):
+def test_bounds(write, monkeypatch, bounded):
     monkeypatch.undo()  # in a process of its own
     path = write("part.usda", stage(square()))
-    for name, value, match in (
-        ("MAX_MESH_FACES", 1, "more than 1 faces"),
-        ("MAX_MESH_PARTS", 0, "more than 0 parts"),
-        ("MAX_MESH_BYTES", 9, "more than 36 bytes"),
-        ("MAX_CAD_SECONDS", 0.001, "took more than 0.001 seconds"),
-    ):
-        monkeypatch.setattr(programs if name == "MAX_CAD_SECONDS" else usd, name, value)
-        with refused(match, MeshError):
-            cr.load_mesh(path, unit="mm")
-        monkeypatch.undo()
+    bounded(path, "more than 1 faces", usd, "MAX_MESH_FACES", 1)
+    bounded(path, "more than 0 parts", usd, "MAX_MESH_PARTS", 0)
+    bounded(path, "more than 36 bytes", usd, "MAX_MESH_BYTES", 9)
+    bounded(path, "took more than 0.001 seconds", programs, "MAX_CAD_SECONDS", 0.001)
