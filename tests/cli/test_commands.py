@@ -65,18 +65,16 @@ sys.exit(__main__.start())
     return done.returncode, done.stdout.split("\n")[:-1]
 
 
-def test_a_process_releases_what_it_shares_with_others():
-    """Such as the lock of progress bars, of which Python warns otherwise."""
-    lock = "global lock; import multiprocessing; lock = multiprocessing.get_context('spawn').Lock()"
-    assert end_of(f"{lock}; return 0") == (0, ["written", "released"])
+LOCK = "global lock; import multiprocessing; lock = multiprocessing.get_context('spawn').Lock()"
+"""Such as that of progress bars: what is not released, Python warns of."""
 
 
-def test_a_process_ends_after_what_its_command_registered_and_is_not_taken_apart():
-    assert end_of("return 3") == (3, ["written", "released"])
-
-
-def test_a_process_ends_as_usual_after_a_mistake_in_its_options():
-    assert end_of("sys.exit(2)") == (2, ["written", "released", "taken apart"])
+@pytest.mark.parametrize(
+    ("outcome", "code", "more"),
+    [("return 3", 3, []), (f"{LOCK}; return 0", 0, []), ("sys.exit(2)", 2, ["taken apart"])],
+)
+def test_a_process_releases_all_and_is_taken_apart_after_a_mistake_alone(outcome, code, more):
+    assert end_of(outcome) == (code, ["written", "released", *more])
 
 
 def test_bank_is_registered_to(folder, register_one, tmp_path, capsys, monkeypatch):

@@ -8,6 +8,7 @@ from curvireg_torch.errors import ImageError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from tests._support import refused
 from tests._support.miniature import pascal_object, write_image, write_pascal3d, write_record
+from tests._support.tables import text_table
 
 pytestmark = pytest.mark.usefixtures("mats_here")
 
@@ -121,22 +122,28 @@ def test_photographs_of_another_size_than_annotated_are_left_out(root):
     assert "bad_image_size" not in cars(root).skipped
 
 
-def test_pascal3d_reports_missing_files_with_advice_and_refuses_invalid_options(root):
+def test_pascal3d_reports_missing_files_with_advice(root):
     with refused(r"datasets/pascal3d/README\.md", MissingFileError):
         Pascal3DPlus(root / "nothing")
     with refused(r"train.*README", MissingFileError):
         Pascal3DPlus(root, "train")
     with refused(r"boat_val\.txt", MissingFileError):
         Pascal3DPlus(root, categories=["boat"])
-    for options, message in (
-        ({"part": "voc"}, "part"),
-        ({"pixel_origin": 2}, "pixel_origin"),
-        ({"categories": "car"}, "list of names"),
-        ({"categories": ["../car"]}, "plain names"),
-        ({"split": "../val", "categories": []}, "plain names"),
-    ):
-        with refused(message):
-            Pascal3DPlus(root, **options)
+
+
+OPTIONS = """
+{"part": "voc"}                        | part
+{"pixel_origin": 2}                    | pixel_origin
+{"categories": "car"}                  | list of names
+{"categories": ["../car"]}             | plain names
+{"split": "../val", "categories": []}  | plain names
+"""
+
+
+@pytest.mark.parametrize(("options", "words"), text_table(OPTIONS))
+def test_pascal3d_refuses_invalid_options(root, options, words):
+    with refused(words):
+        Pascal3DPlus(root, **options)
 
 
 def test_annotation_has_no_image(pascal):

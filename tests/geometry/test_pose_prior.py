@@ -123,15 +123,20 @@ def test_object_frame_puts_up_on_z_and_the_front_towards_azimuth_zero(up):
         assert torch.det(R) == pytest.approx(1.0)
 
 
-def test_pose_prior_refuses_what_it_cannot_mean():
-    for options, message in (
-        ({}, "at least one limit"),
-        ({"azimuth": (1, 2, 3)}, "azimuth: expected 2 finite"),
-        ({"elevation": (50, 40)}, "elevation: expected -90 <= low"),
-        ({"azimuth": (0, 9), "within": 5}, "within: expected degrees beside"),
-        ({"rotation": torch.eye(3), "within": 0.0}, r"within: expected degrees in \(0, 180\]"),
-        ({"rotation": 2 * torch.eye(3), "within": 5.0}, "rotation"),
-        ({"azimuth": (0, 9), "front": "w"}, "front"),
-    ):
-        with refused(message):
-            PosePrior(**options)
+OPTIONS = """
+{}                                 | at least one limit
+{"azimuth": [1, 2, 3]}             | azimuth: expected 2 finite
+{"elevation": [50, 40]}            | elevation: expected -90 <= low
+{"azimuth": [0, 9], "within": 5}   | within: expected degrees beside
+{"azimuth": [0, 9], "front": "w"}  | front
+"""
+OF_ROTATIONS = [
+    ({"rotation": torch.eye(3), "within": 0.0}, r"within: expected degrees in \(0, 180\]"),
+    ({"rotation": 2 * torch.eye(3), "within": 5.0}, "rotation"),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), [*text_table(OPTIONS), *OF_ROTATIONS])
+def test_pose_prior_refuses_what_it_cannot_mean(options, words):
+    with refused(words):
+        PosePrior(**options)

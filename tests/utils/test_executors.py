@@ -55,6 +55,11 @@ class InlineExecutor:
         return future
 
 
+def mapped(blocks, function=doubled, **how):
+    """Tasks and results of an executor of this process, block by block."""
+    return Workers(executor=InlineExecutor(**how)).map(function, None, blocks)
+
+
 @pytest.fixture(autouse=True)
 def no_states():
     yield
@@ -93,38 +98,35 @@ def test_what_is_lost_is_done_again_alone_and_costs_no_other():
 
 
 def test_the_error_names_what_the_worker_said():
-    executor = InlineExecutor(ends={2})
-    error = dict(Workers(executor=executor).map(doubled, None, [[1], [2]]))[2]
+    error = dict(mapped([[1], [2]], ends={2}))[2]
     assert str(error) == "workers: RuntimeError: the worker is gone"
 
 
 @pytest.mark.parametrize("ends", [{1, 2}, {2, 3, 4, 5, 6}])
 def test_workers_that_do_nothing_more_are_an_error(ends):
     """Not one failure after the other for the rest of a long list."""
-    executor = InlineExecutor(ends=ends)
     blocks = [[task] for task in range(1, 9)] if 1 not in ends else [[1], [2]]
     found = []
     with pytest.raises(WorkerError, match="the worker is gone"):
-        found.extend(Workers(executor=executor).map(doubled, None, blocks))
+        found.extend(mapped(blocks, ends=ends))
     failed = [task for task, result in found if isinstance(result, WorkerError)]
     assert len(failed) == len(ends) - (2 if 1 in ends else 1)
 
 
 def test_an_executor_that_is_broken_is_not_renewed():
-    executor = InlineExecutor(ends={1}, error=BrokenExecutor)
     with pytest.raises(WorkerError, match="the workers of the executor ended; give another one"):
-        list(Workers(executor=executor).map(doubled, None, [[1]]))
+        list(mapped([[1]], ends={1}, error=BrokenExecutor))
 
 
 def test_errors_of_the_function_are_raised_here():
     with pytest.raises(InvalidInputError, match="cannot be used") as raised:
-        list(Workers(executor=InlineExecutor()).map(refused, None, [[1]]))
+        list(mapped([[1]], refused))
     assert "in refused" in raised.value.__notes__[0]
 
 
 def test_our_warnings_are_given_here():
     with pytest.warns(CurviregWarning, match="a bank is not kept") as caught:
-        list(Workers(executor=InlineExecutor()).map(warned, None, [[1]]))
+        list(mapped([[1]], warned))
     assert [warning.category for warning in caught] == [CurviregWarning]
 
 
@@ -152,8 +154,7 @@ def test_few_blocks_wait_at_a_time(monkeypatch):
             taken.append(task)
             yield [task]
 
-    results = Workers(executor=InlineExecutor()).map(doubled, None, blocks())
-    next(results)
+    next(mapped(blocks()))
     assert len(taken) <= 3
 
 
