@@ -322,6 +322,12 @@ def test_threemf_reads_colours_and_textures(read_3mf):
     assert "of a kind that is not read" in read_3mf(other)[1][0]
 
 
+def test_an_axis_that_is_given_comes_before_that_of_the_file(tmp_path):
+    path = threemf(tmp_path / "a.3mf", solid(1))
+    assert cr.load_mesh(path).up == "z"
+    assert cr.load_mesh(path, up="-y").up == "-y"
+
+
 def test_threemf_of_several_models(read_3mf):
     resources = (
         '<object id="1"><components><component p:path="/3D/Objects/a.model" '
