@@ -17,3 +17,9 @@ def canister():
     mesh = trimesh.util.concatenate(parts)
     mesh.vertices = np.asarray(mesh.vertices)
     return mesh
+
+
+def box_with_block(size, place):
+    """A box of 200 x 120 x 80 with a block, whose middle lies at a ``place``."""
+    block = trimesh.creation.box(size).apply_translation(place)
+    return trimesh.util.concatenate([trimesh.creation.box((200, 120, 80)), block])

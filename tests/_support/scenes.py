@@ -25,16 +25,14 @@ CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
 
 @cache
 def truck_bank():
-    views = sample_views(azimuth_step=15, elevations=[0, 15, 30, 45, 60])
-    return bank_of(example_mesh(), views, pipeline=PRESETS["classical"], image_size=96)
+    return bank_around(example_mesh(), 15, [0, 15, 30, 45, 60], pipeline=PRESETS["classical"])
 
 
 @cache
 def learned_registrar():
     """A registrar of the truck with the default pipeline, whose results have a confidence, and
     exact boxes."""
-    views = sample_views(azimuth_step=15, elevations=[0, 20, 40, 60])
-    return exact_registrar(bank_of(example_mesh(), views, image_size=96))
+    return exact_registrar(bank_around(example_mesh(), 15, [0, 20, 40, 60]))
 
 
 @cache
@@ -57,9 +55,27 @@ def bank_of(mesh, views=None, **options):
     return ViewBank.build(mesh, views, progress=False, **options)
 
 
+def bank_around(mesh, step, elevations, **options):
+    """A bank of views at 96 px: azimuths in steps, and these elevations."""
+    views = sample_views(azimuth_step=step, elevations=elevations)
+    return bank_of(mesh, views, **{"image_size": 96} | options)
+
+
 def answer_of(registrar, image, box):
     """The result of one photograph of ``CAMERA``."""
     return registrar([image], box[None], CAMERA)[0]
+
+
+def answer_to(seed, registrar):
+    """The result of a scene."""
+    image, box, _ = scene(seed)
+    return answer_of(registrar, image, box)
+
+
+@cache
+def truck_answer():
+    """The result of the first scene by :func:`truck_registrar`."""
+    return answer_to(0, truck_registrar())
 
 
 def degrees_off(result, T):

@@ -8,7 +8,7 @@ import torch
 
 from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.matching import Ranking
-from curvireg_torch.pipeline import PRESETS, Pipeline
+from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import judged
 from tests._support import CAMERA, SIZE, double, eye
@@ -95,13 +95,12 @@ def test_poses_that_merged_come_last_and_are_no_rivals():
 
 
 def test_only_so_many_are_reported_and_the_others_keep_their_shares():
-    evidence = evidence_of(0.6, 0.6, 0.6)
-    every = judgement(poses_at(0.0, 90.0, 180.0), evidence)
-    one = judgement(
-        poses_at(0.0, 90.0, 180.0), evidence, pipeline=replace(Pipeline(), hypotheses=1)
-    )
+    given = poses_at(0.0, 90.0, 180.0), evidence_of(0.6, 0.6, 0.6)
+    every = judgement(*given)
+    one = judgement(*given, pipeline=replace(Pipeline(), hypotheses=1))
     assert len(one.probabilities) == len(one.hypotheses) == 1
     assert one.probabilities == every.probabilities[:1]
+    assert one.confidence_features == every.confidence_features
     assert one.confidence <= 1.0 / 3.0 + 1e-9
 
 
@@ -174,9 +173,3 @@ def test_a_cut_object_is_doubtful_and_warned_of():
     assert result.warnings[:2] == ("of the photograph", "of the mesh")
     assert "outside the photograph" in result.warnings[2]
     assert result.notes == ("note",)
-
-
-def test_pipelines_without_calibration_have_no_probabilities():
-    evidence = evidence_of(0.6, 0.5)
-    result = judgement(poses_at(0.0, 90.0), evidence, pipeline=PRESETS["classical"])
-    assert result.probabilities == ()

@@ -4,13 +4,12 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import sample_views
 from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
 from curvireg_torch.registration import judging
 from tests._support import (
     CAMERA,
-    answer_of,
-    bank_of,
+    answer_to,
+    bank_around,
     double,
     exact_registrar,
     learned_registrar,
@@ -56,11 +55,9 @@ def test_reflected_poses_show_the_mesh_reflected():
 
 
 def test_confidence_falls_where_the_mirror_image_fits_better(monkeypatch):
-    image, box, _ = scene(0)
-    known = learned_registrar()
     for gain, is_doubted in ((-1.0, False), (0.4, False), (1.5, True)):
         monkeypatch.setattr(judging, "mirror_gain", lambda *_, gain=gain: torch.tensor([gain]))
-        result = answer_of(known, image, box)
+        result = answer_to(0, learned_registrar())
         assert (judging.MIRROR_WARNING in result.warnings) == is_doubted
         assert result.reliable != is_doubted
         if is_doubted:
@@ -77,13 +74,11 @@ def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
         return gain
 
     monkeypatch.setattr(judging, "mirror_gain", recorded)
-    image, box, _ = scene(0)
-    own = learned_registrar()
-    assert answer_of(own, image, box).reliable
+    assert answer_to(0, learned_registrar()).reliable
     assert gains == [-torch.inf], "the mirror image has less edge support"
-    views = sample_views(azimuth_step=30, elevations=[0, 30, 60])
-    bank = bank_of(mirrored(own.bank.mesh), views, image_size=96)
+    bank = bank_around(mirrored(learned_registrar().bank.mesh), 30, [0, 30, 60])
     monkeypatch.setattr(judging, "LEAST_CONFIDENCE", 0.0)
+    image, box, _ = scene(0)
     last = image.shape[-1] - 1
     x0, y0, x1, y1 = box.tolist()
     boxes = torch.tensor([[x0, y0, x1, y1], [last - x1, y0, last - x0, y1]])

@@ -8,7 +8,6 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import sample_views
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.mesh.symmetry import FEATURE_FRACTION, feature_fractions
@@ -18,13 +17,15 @@ from tests._support import (
     CAMERA,
     SIZE,
     answer_of,
-    bank_of,
+    bank_around,
+    degrees_off,
     exact_registrar,
     eye,
     seeded,
     seen_from,
     slow_after,
 )
+from tests._support.canisters import box_with_block
 
 
 @cache
@@ -46,16 +47,12 @@ def hollow_box():
 @cache
 def marked_box():
     """A box with a cube of 11.5 % of its radius on one end of its top."""
-    box = trimesh.creation.box((200, 120, 80))
-    cube = trimesh.creation.box((14, 14, 14))
-    cube.apply_translation((85, 0, 47))
-    return trimesh.util.concatenate([box, cube])
+    return box_with_block((14, 14, 14), (85, 0, 47))
 
 
 @cache
-def registrar_of(mesh, **options):
-    views = sample_views(azimuth_step=15, elevations=[10, 30, 50])
-    return exact_registrar(bank_of(mesh, views, image_size=96), **options)
+def registrar_of(mesh):
+    return exact_registrar(bank_around(mesh, 15, [10, 30, 50]))
 
 
 def photograph(mesh, azimuth, elevation, seed):
@@ -68,7 +65,7 @@ def registered(registrar, azimuth, elevation, seed):
     """The result and its error in degrees."""
     image, box, T = photograph(registrar.bank.mesh, azimuth, elevation, seed)
     result = answer_of(registrar, image, box)
-    return result, float(rotation_error(result.rotation, T[:3, :3]))
+    return result, float(degrees_off(result, T))
 
 
 @pytest.mark.parametrize(
@@ -123,12 +120,8 @@ def test_poses_that_the_shape_makes_equal_are_rivals_where_a_small_feature_diffe
 @pytest.mark.parametrize(("side", "notable"), slow_after(1, [(24.0, True), (14.0, False)]))
 def test_poses_that_only_a_hidden_feature_tells_apart_are_named(side, notable):
     """A block on the top of a box that is seen from below; a large one makes the answer unsure."""
-    box = trimesh.creation.box((200, 120, 80))
-    cube = trimesh.creation.box((side, side, 14))
-    cube.apply_translation((75, 0, 47))
-    mesh = trimesh.util.concatenate([box, cube])
-    views = sample_views(azimuth_step=15, elevations=[-50, -35])
-    registrar = exact_registrar(bank_of(mesh, views, image_size=96))
+    mesh = box_with_block((side, side, 14), (75, 0, 47))
+    registrar = exact_registrar(bank_around(mesh, 15, [-50, -35]))
     assert registrar.telling_symmetries.notable == notable
     result, _ = registered(registrar, 30.0, -40.0, 3)
     assert result.feature_is_hidden
