@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-import trimesh
 from torch.testing import assert_close
 
 from curvireg_torch.fitting import details
@@ -15,17 +14,13 @@ from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import synthesize_photograph
 from tests._support import CAMERA, SIZE, double, eye, seeded
+from tests._support.canisters import box_with_block
 from tests._support.hypotheses import HALF_TURN
 
 
 @cache
 def marked_box(unit=1.0):
-    box = trimesh.creation.box((200, 120, 80))
-    cube = trimesh.creation.box((30, 30, 30))
-    cube.apply_translation((80, 0, 55))
-    mesh = trimesh.util.concatenate([box, cube])
-    mesh.apply_scale(unit)
-    return mesh
+    return box_with_block((30, 30, 30), (80, 0, 55)).apply_scale(unit)
 
 
 def compared(*, unit=1.0, wrong=0.0):
