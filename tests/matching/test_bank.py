@@ -26,6 +26,7 @@ from curvireg_torch.terms import Correlation
 from curvireg_torch.utils.files import tensor_checksum
 from tests._support import learned_registrar, refused, scene, seeded
 
+TWO = sample_views(azimuth_step=180, elevations=[0])
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
 
 
@@ -96,12 +97,8 @@ def test_check_compatible_refuses_another_view_policy(truck):
 
 
 def test_a_file_keeps_what_is_known_of_the_mesh(small_bank, tmp_path):
-    known = {
-        "unit": "in",
-        "up": "-y",
-        "warnings": (MeshWarning("stray", "far away"),),
-        "file_name": "truck.ply",
-    }
+    known = {"unit": "in", "up": "-y", "file_name": "truck.ply"}
+    known["warnings"] = (MeshWarning("stray", "far away"),)
     mesh = replace(small_bank.mesh, **known)
     bank = ViewBank(mesh, small_bank.views, small_bank.pipeline, small_bank.tensors)
     bank.save(tmp_path / "bank.safetensors")
@@ -210,7 +207,7 @@ def test_load_restores_the_plane_of_reflection(is_lopsided, tmp_path, monkeypatc
     if is_lopsided:
         lump = trimesh.creation.box((0.5, 0.6, 0.7)).apply_translation((0.7, 0.6, 0.5))
         mesh = trimesh.util.concatenate([mesh, lump])
-    build(mesh, sample_views(azimuth_step=180, elevations=[0])).save(path := tmp_path / "bank")
+    build(mesh, TWO).save(path := tmp_path / "bank")
     plane = reflection_plane(mesh)
     monkeypatch.setattr(reflections, "cKDTree", None)  # would fail
     loaded = reflection_plane(ViewBank.load(path).mesh)
@@ -219,9 +216,7 @@ def test_load_restores_the_plane_of_reflection(is_lopsided, tmp_path, monkeypatc
 
 
 def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
-    bank = build(
-        trimesh.creation.icosphere(5, radius=3.0), sample_views(azimuth_step=180, elevations=[0])
-    )
+    bank = build(trimesh.creation.icosphere(5, radius=3.0), TWO)
     bank.save(path := tmp_path / "bank.safetensors")
     for module, name in (
         (scipy.spatial, "ConvexHull"),
@@ -232,8 +227,8 @@ def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
     mesh = ViewBank.load(path).mesh
     for of in (extreme_points, mesh_symmetries):
         of(mesh).zero_()  # a copy
-    assert torch.equal(extreme_points(mesh), extreme_points(bank.mesh))
-    assert torch.equal(mesh_symmetries(mesh), mesh_symmetries(bank.mesh))
+    for of in (extreme_points, mesh_symmetries):
+        assert torch.equal(of(mesh), of(bank.mesh))
     for part in ("vertices", "faces"):
         np.testing.assert_array_equal(
             getattr(view_mesh(mesh), part), getattr(view_mesh(bank.mesh), part)
@@ -307,17 +302,14 @@ def test_load_refuses_a_packing_of_other_views(packed, tmp_path, name, by):
 @pytest.mark.parametrize("camera", ["orthographic", "perspective"])
 def test_the_covariance_counts_a_picture_of_an_orthographic_camera_once(truck, camera):
     """Its views at several distances are the same picture, which are no more data."""
-    elevations = [0.0, 40.0]
-    views = sample_views(azimuth_step=40.0, elevations=elevations, distances=[3.0, 5.0, 9.0])
-    once = sample_views(azimuth_step=40.0, elevations=elevations, distances=[3.0])
-    bank, same = (
-        build(truck, some, camera=camera, pipeline=PRESETS["classical"]) for some in (views, once)
-    )
-    query = torch.rand(3, bank.descriptors.shape[1], generator=seeded(0))
+    banks = []
+    for distances in ([3.0, 5.0, 9.0], [3.0]):
+        views = sample_views(azimuth_step=40.0, elevations=[0.0, 40.0], distances=distances)
+        banks.append(build(truck, views, camera=camera, pipeline=PRESETS["classical"]))
+    query = torch.rand(3, banks[0].descriptors.shape[1], generator=seeded(0))
     for name in ("precision", "whitening"):
-        found = getattr(bank, name)(query)
-        agrees = bool(torch.allclose(found, getattr(same, name)(query), rtol=1e-3, atol=1e-3))
+        found = [getattr(bank, name)(query) for bank in banks]
+        agrees = torch.allclose(*found, rtol=1e-3, atol=1e-3)
         assert agrees == (camera == "orthographic"), name
-    assert torch.allclose(bank.precision.mean, same.precision.mean, atol=1e-5) == (
-        camera == "orthographic"
-    )
+    means = [bank.precision.mean for bank in banks]
+    assert torch.allclose(*means, atol=1e-5) == (camera == "orthographic")

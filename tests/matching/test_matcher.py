@@ -31,9 +31,8 @@ def test_views_of_the_bank_match_themselves(bank):
         descriptors=bank.descriptors[views, None], points=bank.points_at(views)[:, None]
     )
     assert Correlation().build(bank)(query).argmax(dim=1).tolist() == views
-    assert Repeatability().build(bank)(query)[:, views].diag().tolist() == pytest.approx(
-        [1.0] * 3, abs=0.05
-    )
+    similarity = Repeatability().build(bank)(query)[:, views].diag()
+    assert_close(similarity, torch.ones(3), rtol=0, atol=0.05)
 
 
 def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
@@ -44,13 +43,9 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
     for scores in (ranking.scores, ranking.hog, ranking.repeatability, ranking.terms["box"]):
         assert scores.min() >= 0
         assert scores.max() <= 1 + 1e-6
-    box = ranking.terms["box"].log()
-    parts = (
-        Correlation().log_score(ranking.hog),
-        Repeatability().log_score(ranking.repeatability),
-        box,
-    )
-    assert_close(ranking.scores, sum(parts).exp())
+    product = Correlation().log_score(ranking.hog).exp() * ranking.terms["box"]
+    product = product * Repeatability().log_score(ranking.repeatability).exp()
+    assert_close(ranking.scores, product)
     assert ranking.top(3).equal(ranking.order[:, :3])
     tied = matcher(torch.full((1, 1, 64, 64), 0.5), torch.tensor([[0.0, 0, 50, 50]]))
     assert tied.order[0].tolist() == list(range(len(bank)))
@@ -61,31 +56,28 @@ def test_matcher_is_batch_independent_and_takes_bytes_and_mixed_channels(matcher
     together = matcher(images, boxes)
     assert torch.equal(matcher(list(images), boxes).scores, together.scores)
     for i in range(3):
-        alone = matcher(images[i : i + 1], boxes[i : i + 1])
+        alone = matcher(images[[i]], boxes[[i]])
         assert_close(alone.scores[0], together.scores[i], rtol=1e-4, atol=1e-5)
         assert_close(alone.hog[0], together.hog[i], rtol=1e-5, atol=1e-5)
-    images, boxes = batch(0, 1)
-    exact = (images * 255).round() / 255
     pixels = (images * 255).round().to(torch.uint8)
-    assert_close(matcher(pixels, boxes).scores, matcher(exact, boxes).scores)
-    grey = exact[1].mean(dim=0, keepdim=True)
-    mixed = matcher([pixels[0], grey], boxes)
-    assert_close(mixed.scores[0], matcher(exact[:1], boxes[:1]).scores[0], rtol=1e-4, atol=1e-5)
-    assert_close(mixed.scores[1], matcher([grey], boxes[1:]).scores[0], rtol=1e-4, atol=1e-5)
+    exact = matcher(pixels / 255, boxes).scores
+    assert_close(matcher(pixels, boxes).scores, exact)
+    grey = images[1].mean(dim=0, keepdim=True)
+    mixed = matcher([pixels[0], grey], boxes[:2]).scores
+    assert_close(mixed[0], exact[0], rtol=1e-4, atol=1e-5)
+    assert_close(mixed[1:], matcher([grey], boxes[[1]]).scores, rtol=1e-4, atol=1e-5)
 
 
 def test_matcher_refuses_unusable_input(matcher):
-    for image, boxes, message in (
-        (torch.rand(1, 3, 64, 64), [[5.0, 5, 5, 50]], "X0 < X1"),
-        (
-            torch.rand(2, 3, 64, 64),
-            [[5.0, 5, 50, 50]] * 3,
-            r"shape \(2, 4\), one for each image, got \(3, 4\)",
-        ),
-        (torch.zeros(1, 3, 64, 64, dtype=torch.int16), [[5.0, 5, 50, 50]], "uint8, or floating"),
+    image = torch.rand(1, 3, 64, 64)
+    box = torch.tensor([[5.0, 5, 50, 50]])
+    for images, boxes, message in (
+        (image, torch.tensor([[5.0, 5, 5, 50]]), "X0 < X1"),
+        (image, box.repeat(3, 1), r"shape \(1, 4\), one for each image, got \(3, 4\)"),
+        (image.short(), box, "uint8, or floating"),
     ):
         with refused(message):
-            matcher(image, torch.tensor(boxes))
+            matcher(images, boxes)
 
 
 @pytest.mark.parametrize("channels", [3, 1])
@@ -101,20 +93,17 @@ def test_matcher_passes_colours_to_colour_fields(bank, channels):
 
 
 def test_matcher_weights_terms(bank):
-    images, boxes = batch(0, 1)
     without = bank.pipeline.with_term("repeatability", weight=0).with_term("box", weight=0)
-    plain = ViewMatcher(bank, pipeline=without)(images, boxes)
+    wide = bank.pipeline.with_term("repeatability", sigma=1e6).with_term("box", sigma=1e6)
+    alone = replace(bank.pipeline, terms=(Correlation(),))
+    plain, squared, wide, alone = (
+        ViewMatcher(bank, pipeline=pipeline)(*batch(0, 1))
+        for pipeline in (without, without.with_term("hog", weight=2), wide, alone)
+    )
     assert_close(plain.scores, Correlation().log_score(plain.hog).exp())
     assert set(plain.terms) == {"hog"}, "a term without weight is not computed"
-    squared = ViewMatcher(bank, pipeline=without.with_term("hog", weight=2))(images, boxes)
     assert_close(squared.scores, plain.scores**2)
-    wide = bank.pipeline.with_term("repeatability", sigma=1e6).with_term("box", sigma=1e6)
-    assert_close(
-        ViewMatcher(bank, pipeline=wide)(images, boxes).scores, plain.scores, atol=1e-5, rtol=0
-    )
-    alone = ViewMatcher(bank, pipeline=replace(bank.pipeline, terms=(Correlation(),)))(
-        images, boxes
-    )
+    assert_close(wide.scores, plain.scores, atol=1e-5, rtol=0)
     assert set(alone.terms) == {"hog"}
 
 
@@ -123,25 +112,23 @@ def test_distinct_views_applies_symmetries_to_the_model():
     quarter = rotation_from_axis_angle(double([0.0, 0.0, math.pi / 2]))
     symmetries = torch.stack([eye(3), quarter, quarter @ quarter, quarter.T])
     views = torch.stack([R, R @ quarter, quarter @ R, R @ quarter.T])
-    assert distinct_views(torch.arange(4), views, count=4, symmetries=symmetries).tolist() == [0, 2]
-    assert distinct_views(
-        torch.tensor([3, 2, 1, 0]), views, count=4, symmetries=symmetries
-    ).tolist() == [3, 2]
-    assert distinct_views(torch.arange(4), views, count=4).tolist() == [0, 1, 2, 3]
+    order = torch.arange(4)
+    assert distinct_views(order, views, count=4).equal(order)
+    for some, expected in ((order, [0, 2]), (order.flip(0), [3, 2])):
+        assert distinct_views(some, views, count=4, symmetries=symmetries).tolist() == expected
 
 
 def test_views_exactly_as_far_apart_as_the_angle_count_as_one():
     views = sample_views(azimuth_step=10, elevations=[0, 35])
     order = torch.arange(len(views)).roll(5)
     chosen = distinct_views(order, views.rotations, count=99, angle=20.0)
-    apart = rotation_error(
-        views.rotations[chosen][:, None], views.rotations[chosen]
-    ).fill_diagonal_(180.0)
+    rotations = views.rotations[chosen]
+    apart = rotation_error(rotations[:, None], rotations).fill_diagonal_(180.0)
     assert len(chosen) > 12
     assert apart.min() > 20.01
     assert chosen[0] == order[0]
-    assert len(distinct_views(order, views.rotations, count=99, angle=9.99)) == len(views)
-    assert len(distinct_views(order, views.rotations, count=99, angle=360.0)) == 1
+    for angle, count in ((9.99, len(views)), (360.0, 1)):
+        assert len(distinct_views(order, views.rotations, count=99, angle=angle)) == count
     assert len(distinct_views(order, views.rotations.bfloat16(), count=9, angle=20.0)) == 9
 
 

@@ -15,7 +15,7 @@ from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import ImageGradient
 from curvireg_torch.registration import Follower
 from curvireg_torch.terms import Correlation, QueryFeatures
-from tests._support import CAMERA, answer_of, eye, refused, scene, sequence, truck_bank
+from tests._support import CAMERA, answer_to, eye, refused, scene, sequence, truck_bank
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +35,7 @@ def test_matcher_computes_in_full_precision_under_autocast(small_bank, matcher):
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(scores(matcher), scores(ViewMatcher(small_bank)))
         assert torch.equal(matcher.similarity(query), similarity)
-        assert torch.equal(
-            matcher.features(query.crops).descriptors,
-            matcher.features(query.crops).descriptors.float(),
-        )
+        assert matcher.features(query.crops).descriptors.dtype == torch.float32
         autocast = scores(matcher)
     assert torch.equal(autocast, scores(matcher))
 
@@ -51,8 +48,7 @@ def test_matcher_whitens_in_full_precision_under_autocast(bank):
 
 
 def _boxed(registrar):
-    image, box, _ = scene(0)
-    return answer_of(registrar, image, box).transform
+    return answer_to(0, registrar).transform
 
 
 def _detected(registrar):
@@ -140,10 +136,13 @@ def test_matcher_on_a_gpu_refuses_half_and_ignores_autocast(small_bank):
         assert_close(scores(matcher), expected, atol=1e-4, rtol=0.0)
 
 
-@pytest.mark.cuda
-@pytest.mark.parametrize(
+COPIES = pytest.mark.parametrize(
     "copied", [copy.deepcopy, lambda matcher: pickle.loads(pickle.dumps(matcher))]
 )
+
+
+@pytest.mark.cuda
+@COPIES
 def test_copies_of_a_matcher_stay_on_the_gpu(small_bank, copied):
     matcher = ViewMatcher(small_bank).to("cuda")
     other = copied(matcher)
@@ -151,9 +150,7 @@ def test_copies_of_a_matcher_stay_on_the_gpu(small_bank, copied):
     assert_close(scores(other), scores(matcher), atol=1e-4, rtol=0.0)
 
 
-@pytest.mark.parametrize(
-    "copied", [copy.deepcopy, lambda matcher: pickle.loads(pickle.dumps(matcher))]
-)
+@COPIES
 def test_matcher_can_be_copied_and_pickled(small_bank, copied):
     matcher = ViewMatcher(small_bank)
     expected = scores(matcher)
@@ -182,7 +179,6 @@ def test_hooks_of_the_field_run(small_bank):
     hooked = matcher.query(image[None], box[None])
     assert calls == ["before", "after"]
     assert_close(hooked.field, 2.0 * plain.field)
-    assert hooked.mask is not None
     assert plain.mask is not None
     assert_close(hooked.mask, plain.mask)
     for handle in handles:
@@ -190,13 +186,11 @@ def test_hooks_of_the_field_run(small_bank):
     assert torch.equal(matcher.query(image[None], box[None]).field, plain.field)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        *("forward_pre_hook", "forward_hook", "full_backward_hook", "full_backward_pre_hook"),
-        *("module_forward_hook", "module_forward_pre_hook"),  # of all modules
-    ],
-)
+KINDS = "forward_pre_hook forward_hook full_backward_hook full_backward_pre_hook"
+OF_ALL_MODULES = "module_forward_hook module_forward_pre_hook"
+
+
+@pytest.mark.parametrize("kind", [*KINDS.split(), *OF_ALL_MODULES.split()])
 def test_a_hook_of_any_kind_calls_the_field(kind):
     field = LearnedCurvilinearSaliency()
     seen = []
