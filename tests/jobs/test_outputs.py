@@ -9,9 +9,23 @@ import pytest
 from curvireg_torch.jobs.outputs import FILES, MARKER, check_output_file, output_folder
 from tests._support import refused
 
+SEVERAL = "register several"
+
 
 def marked(folder):
     return json.loads((folder / MARKER).read_text())["commands"]
+
+
+def begin(folder, command, **how):
+    """What a command does before its work."""
+    output_folder(folder, command, **how).__enter__()
+
+
+def complete(folder, command, *names, **how):
+    """A run of a command that writes these files."""
+    with output_folder(folder, command, **how):
+        for name in names:
+            (folder / name).write_text("{}")
 
 
 @pytest.mark.parametrize(
@@ -20,11 +34,8 @@ def marked(folder):
 def test_files_of_others_are_refused_and_named(tmp_path, command, name):
     file = tmp_path / name.replace("*", "1")
     file.write_text("of others")
-    with (
-        refused(rf"{file.name}: not written by this command; move it away"),
-        output_folder(tmp_path, command),
-    ):
-        pytest.fail("work began")
+    with refused(rf"{file.name}: not written by this command; move it away"):
+        begin(tmp_path, command)
     assert file.read_text() == "of others"
     assert not (tmp_path / MARKER).exists()
 
@@ -32,12 +43,11 @@ def test_files_of_others_are_refused_and_named(tmp_path, command, name):
 def test_own_files_are_replaced_and_others_beside_them_do_not_matter(tmp_path):
     (tmp_path / "notes.txt").write_text("of others")
     for _ in range(2):
-        with output_folder(tmp_path, "register"):
-            (tmp_path / "result.json").write_text("{}")
+        complete(tmp_path, "register", "result.json")
     assert marked(tmp_path) == {"register": {"files": ["result.json"], "source": []}}
     (tmp_path / "pose.glb").write_text("a mesh that came later")
-    with refused(r"pose\.glb: not written"), output_folder(tmp_path, "register"):
-        pytest.fail("work began")
+    with refused(r"pose\.glb: not written"):
+        begin(tmp_path, "register")
 
 
 def killed(folder, command, name, **how):
@@ -54,44 +64,38 @@ def killed(folder, command, name, **how):
 
 def test_a_command_that_was_killed_may_go_on(tmp_path):
     """The marker is written before the files."""
-    killed(tmp_path, "register several", "results.jsonl")
+    killed(tmp_path, SEVERAL, "results.jsonl")
     marker = (tmp_path / MARKER).stat().st_mtime_ns
-    with output_folder(tmp_path, "register several"):
+    with output_folder(tmp_path, SEVERAL):
         assert (tmp_path / MARKER).stat().st_mtime_ns == marker, "it is not written again"
         assert (tmp_path / "results.jsonl").exists(), "rows are resumed"
 
 
 @pytest.mark.parametrize("source", [["a.csv"], ["b.csv"]])
 def test_of_two_runs_at_a_time_the_second_is_refused(tmp_path, source):
-    with output_folder(tmp_path, "register several", source=["a.csv"]):
+    with output_folder(tmp_path, SEVERAL, source=["a.csv"]):
         marker = (tmp_path / MARKER).read_bytes()
-        second = output_folder(tmp_path, "register several", source=source)
         with refused("another run is writing its results here"):
-            second.__enter__()
+            begin(tmp_path, SEVERAL, source=source)
         assert (tmp_path / MARKER).read_bytes() == marker
-    with output_folder(tmp_path, "register several", source=source):
-        pass
+    complete(tmp_path, SEVERAL, source=source)
 
 
 def test_a_run_of_another_source_that_was_stopped_is_not_taken_over(tmp_path):
     """Even before it has a result: who started it resumes it."""
-    killed(tmp_path, "register several", None, source=["a.csv"])
+    killed(tmp_path, SEVERAL, None, source=["a.csv"])
     marker = (tmp_path / MARKER).read_bytes()
     with refused(r"a run of a\.csv was stopped here"):
-        output_folder(tmp_path, "register several", source=["b.csv"]).__enter__()
+        begin(tmp_path, SEVERAL, source=["b.csv"])
     assert (tmp_path / MARKER).read_bytes() == marker
-    with output_folder(tmp_path, "register several", source=["a.csv"]):
-        pass
-    with output_folder(tmp_path, "register several", source=["b.csv"]):
-        pass
+    for name in ("a.csv", "b.csv"):
+        complete(tmp_path, SEVERAL, source=[name])
 
 
 @pytest.mark.parametrize("command", FILES)
 def test_what_an_earlier_run_left_goes_first_but_for_rows_that_are_resumed(tmp_path, command):
     names = [name.replace("*", "1") for name in FILES[command]]
-    with output_folder(tmp_path, command):
-        for name in names:
-            (tmp_path / name).write_text("of the first photograph")
+    complete(tmp_path, command, *names)
     with pytest.raises(OSError, match="unreadable"), output_folder(tmp_path, command):
         raise OSError("unreadable")
     left = {path.name for path in tmp_path.iterdir()} - {MARKER}
@@ -108,31 +112,26 @@ def test_an_error_of_the_command_keeps_its_files(tmp_path):
     assert marked(tmp_path)["demo"]["files"] == ["mesh.ply"]
 
 
-PAIRS = [
-    ("follow", "results.csv", "register several"),
-    ("evaluate", "results.jsonl", "register several"),
-    ("demo", "result.json", "register"),
-]
-
-
-@pytest.mark.parametrize(("first", "name", "second"), PAIRS)
+@pytest.mark.parametrize(
+    ("first", "name", "second"),
+    [
+        ("follow", "results.csv", SEVERAL),
+        ("evaluate", "results.jsonl", SEVERAL),
+        ("demo", "result.json", "register"),
+    ],
+)
 def test_files_of_another_command_are_refused(tmp_path, first, name, second):
-    with output_folder(tmp_path, first):
-        (tmp_path / name).write_text("")
-    with refused(rf"{name}: a result of 'curvireg {first}'"):
-        output_folder(tmp_path, second).__enter__()
-    (tmp_path / name).unlink()
-    with output_folder(tmp_path, second):
-        (tmp_path / name).write_text("")
-    with refused(f"a result of 'curvireg {second}'"):
-        output_folder(tmp_path, first).__enter__()
+    for one, other in ((first, second), (second, first)):
+        complete(tmp_path, one, name)
+        with refused(rf"{name}: a result of 'curvireg {one}'"):
+            begin(tmp_path, other)
+        (tmp_path / name).unlink()
 
 
 def test_inputs_are_refused_under_any_name(tmp_path):
     """Also one that the command itself wrote before, and a link to it."""
     out = tmp_path / "out"
-    with output_folder(out, "register"):
-        (out / "result.json").write_text("{}")
+    complete(out, "register", "result.json")
     os.link(out / "result.json", tmp_path / "start.json")
     (tmp_path / "link.json").symlink_to(out / "result.json")
     for path in (
@@ -142,22 +141,17 @@ def test_inputs_are_refused_under_any_name(tmp_path):
         tmp_path / "link.json",
     ):
         with refused(rf"{path.name}: an input of this command"):
-            output_folder(out, "register", inputs=[tmp_path / "none", path]).__enter__()
+            begin(out, "register", inputs=[tmp_path / "none", path])
 
 
 def test_results_of_another_source_would_be_lost(tmp_path):
-    with output_folder(tmp_path, "register several", source=["a.jpg", "b.jpg"]):
-        (tmp_path / "results.csv").write_text("")
+    complete(tmp_path, SEVERAL, "results.csv", source=["a.jpg", "b.jpg"])
     with refused(r"holds results of b\.jpg, which would be lost"):
-        output_folder(tmp_path, "register several", source=["a.jpg", "c.jpg"]).__enter__()
-    with output_folder(tmp_path, "register several"):
-        pass
-    assert marked(tmp_path)["register several"]["source"] == ["a.jpg", "b.jpg"], (
-        "where none is given, it stays"
-    )
-    with output_folder(tmp_path, "register several", source=["c.jpg", "b.jpg", "a.jpg"]):
-        pass
-    assert marked(tmp_path)["register several"]["source"] == ["c.jpg", "b.jpg", "a.jpg"]
+        begin(tmp_path, SEVERAL, source=["a.jpg", "c.jpg"])
+    complete(tmp_path, SEVERAL)
+    assert marked(tmp_path)[SEVERAL]["source"] == ["a.jpg", "b.jpg"], "of none, it stays"
+    complete(tmp_path, SEVERAL, source=["c.jpg", "b.jpg", "a.jpg"])
+    assert marked(tmp_path)[SEVERAL]["source"] == ["c.jpg", "b.jpg", "a.jpg"]
 
 
 @pytest.mark.parametrize(
@@ -166,7 +160,7 @@ def test_results_of_another_source_would_be_lost(tmp_path):
 def test_damaged_markers_are_refused(tmp_path, content):
     (tmp_path / MARKER).write_text(content)
     with refused(rf"{MARKER}: "):
-        output_folder(tmp_path, "register").__enter__()
+        begin(tmp_path, "register")
 
 
 def test_files_that_are_named_are_replaced_only_with_our_mark(tmp_path):

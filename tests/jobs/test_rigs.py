@@ -1,6 +1,7 @@
 """What reading a rig or a list costs; tests/cli/test_views.py checks what is read."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,8 @@ from tests._support.spies import spied
 
 POSE = [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1]
 COLUMNS = "photo,camera," + ",".join((*rigs.ROTATION, *rigs.TRANSLATION))
+CALIBRATION = {"camera_matrix": [300.0, 0, 1, 0, 300, 1, 0, 0, 1]}
+LENS = Camera([[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]], size=(180, 240))
 LINE = "1 PINHOLE 640 480 500 500 320 240"
 
 
@@ -71,35 +74,33 @@ def test_a_name_of_colmap_keeps_its_inner_blanks(tmp_path, images):
 
 def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path, monkeypatch):
     read = spied(monkeypatch, calibrations, "read_document")
-    camera = {"camera_matrix": [300.0, 0, 1, 0, 300, 1, 0, 0, 1]}
-    (tmp_path / "a.json").write_text(json.dumps({f"c{k}": camera for k in range(5)}))
-    (tmp_path / "b.json").write_text(json.dumps(camera))
+
+    def check_read(*names):
+        assert sorted(file.name for (file,) in read) == [*names]
+        read.clear()
+
+    (tmp_path / "a.json").write_text(json.dumps({f"c{k}": CALIBRATION for k in range(5)}))
+    (tmp_path / "b.json").write_text(json.dumps(CALIBRATION))
     names = [*(f"a.json:c{k}" for k in range(5)), "b.json", "b.json"]
-    rig = written(
-        tmp_path / "rig.csv", COLUMNS, *([f"{k}.png", name, *POSE] for k, name in enumerate(names))
-    )
-    assert len(read_rig(rig)) == 7
-    assert sorted(file.name for (file,) in read) == ["a.json", "b.json"]
-    read.clear()
+    rows = [[f"{k}.png", name, *POSE] for k, name in enumerate(names)]
+    assert len(read_rig(written(tmp_path / "rig.csv", COLUMNS, *rows))) == 7
+    check_read("a.json", "b.json")
     rows = [[f"{k}.png", 0, 0, 9, 9, name] for k, name in enumerate(names)]
     photos = written(tmp_path / "list.csv", "photo,x0,y0,x1,y1,camera", *rows)
     entries = read_list(photos, RegisterOptions(meshes=(tmp_path / "a.ply",)))
     assert [entry.error for entry in entries] == [""] * 7
-    assert sorted(file.name for (file,) in read) == ["a.json", "b.json"]
-    read.clear()
+    check_read("a.json", "b.json")
     cameras = [LINE.replace("1 ", f"{k} ", 1) for k in range(7)]
     (tmp_path / "cameras.txt").write_text("\n".join(cameras))
     images = [f"{k} 1 0 0 0 0 0 1 {k} {k}.png\n\n" for k in range(7)]
     (tmp_path / "images.txt").write_text("".join(images))
     assert len(read_rig(tmp_path)) == 7
-    assert [file.name for (file,) in read] == ["cameras.txt"]
+    check_read("cameras.txt")
 
 
 def test_rigs_and_lists_are_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(rigs, "MAX_RIG_VIEWS", 2)
-    (tmp_path / "b.json").write_text(
-        json.dumps({"camera_matrix": [300.0, 0, 1, 0, 300, 1, 0, 0, 1]})
-    )
+    (tmp_path / "b.json").write_text(json.dumps(CALIBRATION))
     rows = [[f"{k}.png", "b.json", *POSE] for k in range(3)]
     assert len(read_rig(written(tmp_path / "rig.csv", COLUMNS, *rows[:2]))) == 2
     with refused(r"rig\.csv: more than 2 photographs; leave some out"):
@@ -148,24 +149,16 @@ def test_every_photograph_of_colmap_is_read_with_and_without_lines_of_points(
 
 
 @pytest.mark.parametrize(
-    ("header", "row", "message"),
+    ("columns", "cells", "message"),
     [
-        (f"{COLUMNS},photo", ["a.png", "cameras.txt", *POSE, "b.png"], "header: two columns photo"),
-        (
-            COLUMNS,
-            ["a.png", "cameras.txt", *POSE, "5"],
-            r"row 1: a\.png: '5' is beyond the last column",
-        ),
-        (
-            f"{COLUMNS},qw,qx,qy,qz",
-            ["a.png", "cameras.txt", *POSE, 1, 0, 0, 0],
-            r"row 1: a\.png: r11 to r33 and qw to qz",
-        ),
+        (",photo", ["b.png"], "header: two columns photo"),
+        ("", ["5"], r"row 1: a\.png: '5' is beyond the last column"),
+        (",qw,qx,qy,qz", [1, 0, 0, 0], r"row 1: a\.png: r11 to r33 and qw to qz"),
     ],
 )
-def test_rows_of_a_rig_with_too_much_are_refused(rig, header, row, message):
+def test_rows_of_a_rig_with_too_much_are_refused(rig, columns, cells, message):
     with refused(message):
-        rig(header, row)
+        rig(COLUMNS + columns, ["a.png", "cameras.txt", *POSE, *cells])
 
 
 QUATERNION_COLUMNS = "photo,camera,qw,qx,qy,qz,tx,ty,tz"
@@ -243,17 +236,16 @@ def test_an_object_that_a_photograph_of_bop_shows_twice_has_no_box_there(tmp_pat
     assert found[1:] == [None, None]
 
 
+def view(photo, camera, scale=1.0):
+    return Entry(name=photo.name, photo=photo, camera=camera, T_cam_from_world=scale * eye(4))
+
+
 def test_a_photograph_that_does_not_fit_its_camera_leaves_the_others(tmp_path):
     """It counts as one that cannot be read."""
-    camera = Camera([[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]], size=(180, 240))
-    rows = [("0.png", (240, 180)), ("1.png", (240, 90)), ("none.png", None), ("2.png", (480, 360))]
-    views = []
-    for name, size in rows:
-        if size is not None:
-            Image.new("RGB", size).save(tmp_path / name)
-        T = eye(4)
-        views.append(Entry(name=name, photo=tmp_path / name, camera=camera, T_cam_from_world=T))
-    first, narrow, missing, last = prepare_views(views)
+    for name, size in (("0.png", (240, 180)), ("1.png", (240, 90)), ("2.png", (480, 360))):
+        Image.new("RGB", size).save(tmp_path / name)
+    names = ("0.png", "1.png", "none.png", "2.png")
+    first, narrow, missing, last = prepare_views([view(tmp_path / name, LENS) for name in names])
     assert (first.size, last.size) == ((180, 240), (360, 480))
     assert float(last.K[0, 0]) == 520.0
     assert "another aspect ratio" in str(narrow)
@@ -262,19 +254,9 @@ def test_a_photograph_that_does_not_fit_its_camera_leaves_the_others(tmp_path):
 
 def test_rows_of_a_rig_have_the_camera_at_the_size_of_the_photograph(tmp_path, monkeypatch):
     """That of one which cannot be used as it was given."""
-    camera = Camera(
-        [[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]], (0.1, 0.0, 0.0, 0.0), size=(180, 240)
-    )
+    camera = replace(LENS, distortion=(0.1, 0.0, 0.0, 0.0))
     Image.new("RGB", (480, 360)).save(tmp_path / "0.png")
-    rig = [
-        Entry(
-            name=name,
-            photo=tmp_path / name,
-            camera=camera,
-            T_cam_from_world=(number + 1.0) * eye(4),
-        )
-        for number, name in enumerate(("0.png", "none.png"))
-    ]
+    rig = [view(tmp_path / "0.png", camera), view(tmp_path / "none.png", camera, scale=2.0)]
     monkeypatch.setattr(rigs, "register_views", lambda *_: None)
     monkeypatch.setattr(rigs, "result_document", lambda *_: {"photographs": [{}, {}]})
     found = rigs.register_rig(Path("rig"), rig, prepare_views(rig), None, bank_seconds=0.0)

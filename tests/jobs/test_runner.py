@@ -27,12 +27,9 @@ def entries(tmp_path, threads):
     for name in ("0.png", "1.png", "skin.png"):
         (tmp_path / name).write_text(name)
     (tmp_path / "a.stl").write_text("a")
-    text = (
-        "mtllib skin.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl skin\nf "
-        "1/1 "
-        "2/2 3/3\n"
-    )
-    (tmp_path / "b.obj").write_text(text)
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    face = "usemtl skin\nf 1/1 2/2 3/3\n"
+    (tmp_path / "b.obj").write_text(f"mtllib skin.mtl\n{corners}{face}")
     (tmp_path / "skin.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
     pairs = [(photo, mesh) for photo in ("0.png", "1.png") for mesh in ("a.stl", "b.obj")]
     return [
@@ -97,13 +94,14 @@ def test_changed_files_are_registered_again(entries, tmp_path, name, again):
 
 
 def test_other_requests_settings_and_code_are_registered_again(entries, tmp_path, monkeypatch):
-    registered(entries, tmp_path / "out")
+    out = tmp_path / "out"
+    registered(entries, out)
     changed = [replace(entries[0], box=(1.0, 2.0, 3.0, 4.0)), *entries[1:]]
-    assert registered(changed, tmp_path / "out") == ["0a"]
-    assert len(registered(changed, tmp_path / "out", settings={"hypotheses": 2})) == 4
-    assert registered(changed, tmp_path / "out", settings={"hypotheses": 2}) == []
+    assert registered(changed, out) == ["0a"]
+    for count in (4, 0):
+        assert len(registered(changed, out, settings={"hypotheses": 2})) == count
     monkeypatch.setattr(runner, "results_digest", lambda: "newer")
-    assert len(registered(changed, tmp_path / "out", settings={"hypotheses": 2})) == 4
+    assert len(registered(changed, out, settings={"hypotheses": 2})) == 4
 
 
 @pytest.mark.parametrize(
@@ -170,13 +168,8 @@ def test_only_photographs_with_a_row_are_digested_before_they_are_registered(
 
     def register(_, tasks):
         before.append(list(digested))
-        return [
-            runner.Finished(
-                {"digests": {"request": task.request, "photo": "unchanged"}, "verdict": "reliable"},
-                None,
-            )
-            for task in tasks
-        ]
+        digests = [{"request": task.request, "photo": "unchanged"} for task in tasks]
+        return [runner.Finished({"digests": d, "verdict": "reliable"}, None) for d in digests]
 
     monkeypatch.setattr(runner, "file_digest", digest)
     monkeypatch.setattr(runner, "_register_block", register)
@@ -222,13 +215,13 @@ def test_the_first_of_a_block_pays_for_the_bank(monkeypatch):
 
 def test_a_missing_photograph_beside_others_is_tried_again(entries, tmp_path):
     """Of several photographs of one pose."""
-    gone = Entry(photo=tmp_path / "gone.png", camera=CAMERA, T_cam_from_world=torch.eye(4))
+    gone = replace(VIEWS[0], photo=tmp_path / "gone.png")
     rig = [replace(entries[0], views=(gone,)), replace(entries[2], views=(gone,))]
-    assert registered(rig, tmp_path / "out") == ["0a", "1a"]
-    assert registered(rig, tmp_path / "out") == ["0a", "1a"]
+    for _ in range(2):
+        assert registered(rig, tmp_path / "out") == ["0a", "1a"]
     gone.photo.write_text("found again")
-    assert registered(rig, tmp_path / "out") == ["0a", "1a"]
-    assert registered(rig, tmp_path / "out") == []
+    for labels in (["0a", "1a"], []):
+        assert registered(rig, tmp_path / "out") == labels
 
 
 CAMERA = Camera(torch.eye(3))
@@ -248,25 +241,23 @@ CAMERAS = (replace(CAMERA, size=(5, 6)), None, "exif", 50.0)
 
 
 def test_request_covers_every_option_and_other_views():
-    changes = [
-        *OTHERS.items(),
-        *(("box", box) for box in BOXES),
-        *(("camera", camera) for camera in CAMERAS),
-    ]
-    for name, value in changes:
+    assert ENTRY.request() == replace(ENTRY).request()
+    assert ENTRY.key == replace(ENTRY, cells={"note": "y"}).key
+    boxes = [("box", box) for box in BOXES]
+    cameras = [("camera", camera) for camera in CAMERAS]
+    for name, value in (*OTHERS.items(), *boxes, *cameras):
         changed = replace(ENTRY, **{name: value})
-        assert changed.request() != ENTRY.request() == replace(ENTRY).request(), (name, value)
-        assert changed.key != ENTRY.key == replace(ENTRY, cells={"note": "y"}).key, (name, value)
+        assert changed.request() != ENTRY.request(), (name, value)
+        assert changed.key != ENTRY.key, (name, value)
     started = replace(ENTRY, start=OTHERS["start"])
     for start in STARTS:
-        changed = replace(ENTRY, start=start)
-        assert changed.request() != started.request() != ENTRY.request(), start
-    values = {
-        "box": (1.0, 2.0, 3.0, 4.0),
-        "camera": Camera(2 * torch.eye(3) - torch.diag(torch.tensor([0.0, 0, 1]))),
-    }
-    for name, value in {**values, "T_cam_from_world": 2.0 * torch.eye(4)}.items():
-        other = replace(VIEWS[0], **{name: value})
-        assert replace(ENTRY, views=(other,)).request() != replace(ENTRY, views=VIEWS).request(), (
-            name
-        )
+        assert replace(ENTRY, start=start).request() != started.request(), start
+    wider = Camera(torch.diag(torch.tensor([2.0, 2.0, 1.0])))
+    seen = replace(ENTRY, views=VIEWS)
+    for change in (
+        {"box": (1.0, 2.0, 3.0, 4.0)},
+        {"camera": wider},
+        {"T_cam_from_world": 2.0 * torch.eye(4)},
+    ):
+        other = replace(ENTRY, views=(replace(VIEWS[0], **change),))
+        assert other.request() != seen.request(), change

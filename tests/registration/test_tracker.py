@@ -26,7 +26,7 @@ from curvireg_torch.fitting.regions import (
 )
 from curvireg_torch.fitting.texture_fit import surface_corners
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
-from curvireg_torch.geometry.cameras import transform
+from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.registration import tracking
 from curvireg_torch.registration.tracking import FLOW_SCALES, Tracker
@@ -54,6 +54,12 @@ def started():
     return follow
 
 
+def measured():
+    """A tracker of the cube, and what it measures in the first frame again."""
+    follow = started()
+    return follow, follow.measure(drawn(START), K, START)
+
+
 def moved(T, angles, shift):
     out = T.clone()
     out[:3, :3] = rotation_from_axis_angle(double(angles)) @ T[:3, :3]
@@ -64,16 +70,14 @@ def moved(T, angles, shift):
 def drawn(T, inside=(0.8, 0.2, 0.2), outside=(0.2, 0.5, 0.3)):
     """A cube of one colour on a background of another."""
     mask = make_renderer(cube()).render(T[None], K, SIZE)[0] > 0
-    return torch.where(
-        mask, torch.tensor(inside)[:, None, None], torch.tensor(outside)[:, None, None]
-    )
+    return torch.where(mask, *(torch.tensor(colour)[:, None, None] for colour in (inside, outside)))
 
 
 def shift_in_pixels(T, truth):
     """Mean distance of the cube's corners in the image."""
     corners = torch.from_numpy(cube().vertices)
-    uv = [(corners @ P[:3, :3].mT + P[:3, 3]) @ K.mT for P in (T, truth)]
-    return float((uv[0][:, :2] / uv[0][:, 2:] - uv[1][:, :2] / uv[1][:, 2:]).norm(dim=1).mean())
+    shift = project_points(corners, T, K) - project_points(corners, truth, K)
+    return float(shift.norm(dim=1).mean())
 
 
 def plate(x=0.0, y=0.0):
@@ -170,25 +174,22 @@ def test_a_step_follows_edges_the_end_of_the_colours_and_corners(monkeypatch):
 
 
 def test_colours_are_learned_in_a_band_on_both_sides_of_the_outline(monkeypatch):
-    follow = started()
-    found = follow.measure(drawn(START), K, START)
+    follow, found = measured()
     learned = []
     monkeypatch.setattr(follow._regions, "learn", lambda *given: learned.extend(given))
     follow.accept(found)
     _, lines, _, inside = learned
     silhouette = follow._silhouette(found.frame, found.state)
     across = ((lines - silhouette.uv[:, None]) * silhouette.normals[:, None]).sum(dim=2)
-    band = [*tracking.LEARNED_BAND]
-    expected = double([*(-distance for distance in band), *band])
-    assert torch.allclose(across, expected.expand_as(across))
+    band = double(tracking.LEARNED_BAND)
+    assert torch.allclose(across, torch.cat([-band, band]).expand_as(across))
     assert not inside[across > 0].any()
     assert inside[across < 0].double().mean() > 0.9
 
 
 def test_directions_lead_from_the_centre_of_the_object():
     """Which is not that of the crop: the camera's principal point is 20 px to the left."""
-    follow = started()
-    found = follow.measure(drawn(START), K, START)
+    follow, found = measured()
     shifted = found.frame.K.clone()
     shifted[0, 0, 2] += 20.0
     silhouette = follow._silhouette(replace(found.frame, K=shifted), found.state)
@@ -206,12 +207,12 @@ def test_tracker_follows_a_generated_sequence_until_the_object_is_absent():
     for image, _, T in frames[1:]:
         found = follow.track(image, CAMERA)
         follow.accept(found)
-        assert rotation_error(found.state.T[0, :3, :3], T[:3, :3]) < 2.0
+        R = found.state.T[0, :3, :3]
+        assert rotation_error(R, T[:3, :3]) < 2.0
         assert ((found.state.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.02
         assert found.confidence > 0.5
         assert all(0.0 <= value <= 1.0 for value in found.features.values())
-        R = found.state.T[0, :3, :3]
-        assert (R @ R.mT - torch.eye(3)).abs().max() < 1e-12
+        assert (R @ R.mT - eye(3)).abs().max() < 1e-12
         C = follow.covariance(found)
         assert torch.linalg.eigvalsh(C).min() > 0
         assert torch.rad2deg(C[:3, :3].diagonal().sqrt()).max() < 20.0
@@ -221,10 +222,8 @@ def test_tracker_follows_a_generated_sequence_until_the_object_is_absent():
 
 def test_covariance_counts_edges_near_the_pose():
     """At a pose that is 5 % too near, all edges are some 4 px inside its outline."""
-    follow = make_tracker(cube())
-    near = START.clone()
-    near[2, 3] *= 0.95
-    follow.start(drawn(START), K, START)
+    follow = started()
+    near = moved(START, [0.0, 0.0, 0.0], [0.0, 0.0, -0.3])
     there, beside = (follow.covariance(follow.measure(drawn(START), K, T)) for T in (START, near))
     assert there.isfinite().all()
     assert beside.isnan().all()
@@ -232,20 +231,15 @@ def test_covariance_counts_edges_near_the_pose():
 
 def test_pose_outside_the_image_is_lost():
     follow = make_tracker(cube())
-    with refused("outside", LostObjectError):
-        follow.start(drawn(START), K, moved(START, [0.0, 0.0, 0.0], [5.0, 0.0, 0.0]))
-    behind = START.clone()
-    behind[2, 3] = -6.0
-    with pytest.raises(LostObjectError):
-        follow.start(drawn(START), K, behind)
+    for shift in ([5.0, 0.0, 0.0], [0.0, 0.0, -12.0]):
+        with refused("outside", LostObjectError):
+            follow.start(drawn(START), K, moved(START, [0.0, 0.0, 0.0], shift))
 
 
 def test_posterior_is_that_of_bayes():
     ratio = double([[0.3, -0.2, 0.9, -1.1, 0.4]])
-    # ends at -1.5, -0.5, 0.5, 1.5
-    likelihood = [math.exp(0.3), math.exp(0.1), math.exp(1.0), math.exp(-0.1)]
-    p = torch.tensor(likelihood) / sum(likelihood)
-    d = torch.tensor([-1.5, -0.5, 0.5, 1.5])
+    p = double([0.3, 0.1, 1.0, -0.1]).softmax(dim=0)
+    d = double([-1.5, -0.5, 0.5, 1.5])
     mean, variance = line_posterior(ratio, 2)
     assert float(mean) == pytest.approx(float((p * d).sum()), abs=1e-6)
     assert float(variance) == pytest.approx(float((p * d**2).sum() - (p * d).sum() ** 2), abs=1e-6)
@@ -260,31 +254,38 @@ def halves():
     return colour_bins(colours), torch.stack([x, y], dim=-1)
 
 
-def test_log_ratio_has_the_sign_of_the_learned_colours():
+RIGHT = torch.zeros(8)
+"""Directions of the lines."""
+
+
+def learned():
+    """A model of a red object on the left of a green background."""
     bins, uv = halves()
     model = RegionModel()
-    zero = torch.zeros(8)
-    model.learn(bins, uv, zero, uv[..., 0] < 8)
-    ratio = model.log_ratio(bins, uv, zero)
+    model.learn(bins, uv, RIGHT, uv[..., 0] < 8)
+    return model
+
+
+def test_log_ratio_has_the_sign_of_the_learned_colours():
+    bins, uv = halves()
+    model = learned()
+    ratio = model.log_ratio(bins, uv, RIGHT)
     assert (ratio[:, :8] > 0.3).all()
     assert (ratio[:, 8:] < -0.3).all()
     # nothing learned there but the mean of all directions
-    opposite = model.log_ratio(bins, uv, zero + math.pi)
+    opposite = model.log_ratio(bins, uv, RIGHT + math.pi)
     assert (opposite[:, :8] > 0.1).all()
     assert (opposite[:, :8] < ratio[:, :8]).all()
-    outside = model.log_ratio(bins, uv - 100.0, zero)
-    assert (outside == 0).all()
+    assert (model.log_ratio(bins, uv - 100.0, RIGHT) == 0).all()
 
 
 def test_histograms_move_by_the_rate_towards_new_colours():
     bins, uv = halves()
-    model = RegionModel()
-    directions = torch.zeros(8)
+    model = learned()
     red = bins[0, 0]
     green = bins[0, 15]
-    model.learn(bins, uv, directions, uv[..., 0] < 8)
     assert float(model._histograms[0, 0, red]) == 1.0
-    model.learn(bins, uv, directions, uv[..., 0] >= 8)  # the colours swap
+    model.learn(bins, uv, RIGHT, uv[..., 0] >= 8)  # the colours swap
     step = 0.2 * 64 / (64 + HALF_RATE_COUNT)
     assert float(model._histograms[0, 0, green]) == pytest.approx(step)
     assert float(model._histograms[0, 0, red]) == pytest.approx(1.0 - step)
@@ -293,24 +294,21 @@ def test_histograms_move_by_the_rate_towards_new_colours():
 def test_log_ratio_changes_evenly_between_the_middles_of_two_sectors():
     """Red and green are learned to the right: in the next sector, only their mean is known."""
     bins, uv = halves()
-    model = RegionModel()
-    right = torch.zeros(8)
-    sector = 2.0 * math.pi / SECTORS
-    model.learn(bins, uv, right, uv[..., 0] < 8)
-    before, first, between, second = (
-        float(model.log_ratio(bins, uv, right + part * sector)[0, 0])
-        for part in (-1 / 3, 0.0, 1 / 3, 1.0)
+    model = learned()
+    before, first, between, second, around = (
+        float(model.log_ratio(bins, uv, RIGHT + part * 2.0 * math.pi / SECTORS)[0, 0])
+        for part in (-1 / 3, 0.0, 1 / 3, 1.0, -SECTORS)
     )
     assert first > second + 0.1 > 0.2
     assert between == pytest.approx((2.0 * first + second) / 3.0, abs=1e-6)
     assert before == pytest.approx(between, abs=1e-5)
-    assert float(model.log_ratio(bins, uv, right - 2.0 * math.pi)[0, 0]) == first
+    assert around == first
 
 
 def test_what_lies_outside_the_window_is_not_learned():
     bins, uv = halves()
     model = RegionModel()
-    model.learn(bins, uv - 100.0, torch.zeros(8), uv[..., 0] < 8)
+    model.learn(bins, uv - 100.0, RIGHT, uv[..., 0] < 8)
     assert model._histograms.sum() == 0.0
 
 

@@ -96,12 +96,11 @@ def fitted(monkeypatch, keyframes, last, shift=100.0, *, stale=False):
 
 
 def test_a_fit_uses_the_flow_from_the_last_frame_and_from_the_nearest_keyframe(monkeypatch):
-    weights, _, _ = fitted(monkeypatch, [1, 2, 3], 4)[0]
-    last = tracking.POINT_WEIGHT * (40 + tracking.PYRAMID_LAST)
     keyframe = tracking.KEYFRAME_WEIGHT * (20 + tracking.PYRAMID_KEYFRAME)
-    assert weights == pytest.approx([last, keyframe])
-    weights, _, _ = fitted(monkeypatch, [1, 2, 3], 2)[0]
-    assert weights == pytest.approx([tracking.POINT_WEIGHT * (20 + tracking.PYRAMID_LAST)])
+    for number, also in ((4, [keyframe]), (2, [])):
+        weights, _, _ = fitted(monkeypatch, [1, 2, 3], number)[0]
+        last = tracking.POINT_WEIGHT * (10 * number + tracking.PYRAMID_LAST)
+        assert weights == pytest.approx([last, *also])
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -141,14 +140,14 @@ def test_features_in_closed_form():
     """A flat posterior has a variance of a third of the radius' square."""
     flat = tracking.REGION_FEATURE_RADIUS**2 / 3.0
     variances = [0.0, 0.0, 0.5 * flat, flat]
-    found = features([0.0, 2.0, 0.0, 0.0], variances, flow(0.8), flow(0.3))
     region = (1.0 + math.exp(-0.5) + 0.5) / 4.0
-    expected = {"edge_support": 0.4, "region": region, "flow": 0.8, "keyframe": 0.3}
-    assert found == pytest.approx(expected)
-    alone = features([0.0], [2.0 * flat], flow(0.8))
-    assert (alone["region"], alone["flow"], alone["keyframe"]) == (0.0, 0.8, 0.8)
-    none = features([], [])
-    assert (none["region"], none["flow"], none["keyframe"]) == (0.0, 0.0, 0.0)
+    for given, expected in (
+        (([0.0, 2.0, 0.0, 0.0], variances, flow(0.8), flow(0.3)), (region, 0.8, 0.3)),
+        (([0.0], [2.0 * flat], flow(0.8)), (0.0, 0.8, 0.8)),
+        (([], []), (0.0, 0.0, 0.0)),
+    ):
+        names = ("edge_support", "region", "flow", "keyframe")
+        assert features(*given) == pytest.approx(dict(zip(names, (0.4, *expected), strict=True)))
 
 
 @pytest.mark.parametrize(
