@@ -1,11 +1,13 @@
 """Poses beside a photograph, and evidence for them, in closed cases."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import torch
 
-from curvireg_torch.evidence import Evidence
+from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support.numbers import double
 from tests._support.scenes import CAMERA
@@ -29,12 +31,9 @@ def placed_at(T, centre, K=CAMERA, photograph=None):
 
 def poses_at(*degrees, x=0.0, centre=(0.0, 0.0, 0.0)):
     """Of the views 0, 1, ..., five units away and ``x`` to the right."""
-    R = turned(*degrees)
-    count = len(R)
-    T = transform(R, double([x, 0.0, 5.0]).expand(count, 3))
-    rank = torch.zeros(count, dtype=torch.float64)
-    cameras = CAMERA.expand(count, 3, 3)
-    return Hypotheses.at(T, cameras, torch.as_tensor(centre).double(), torch.arange(count), rank)
+    T = transform(turned(*degrees), double([x, 0.0, 5.0]).expand(len(degrees), 3))
+    poses = placed_at(T, torch.as_tensor(centre).double())
+    return replace(poses, view=torch.arange(len(T)))
 
 
 def evidence_of(*similarity, **columns):
@@ -43,3 +42,21 @@ def evidence_of(*similarity, **columns):
     known = known or {"similarity": double(similarity)}
     nothing = torch.zeros_like(next(iter(known.values())))
     return Evidence(**{field.name: known.get(field.name, nothing) for field in fields(Evidence)})
+
+
+def competing(poses, evidence, outside=None):
+    """The poses with this evidence, some of them outside the limits."""
+    return replace(
+        poses, evidence=evidence, is_outside=torch.tensor(outside or [False] * len(poses))
+    )
+
+
+def all_kept(poses):
+    """Limits that keep all poses."""
+    return torch.ones(len(poses), dtype=torch.bool)
+
+
+def target_of(**attributes):
+    """A registrar by its default weights and pipeline, and what else a function asks for."""
+    known = {"score_weights": lambda **_: EvidenceWeights(), "pipeline": Pipeline()}
+    return SimpleNamespace(**known | attributes)

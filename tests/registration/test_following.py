@@ -31,36 +31,45 @@ from tests._support import (
 )
 from tests._support.hypotheses import HALF_TURN
 from tests._support.results import registration
+from tests._support.spies import spied
 
 TRACKED = {"edge_support", "region", "flow", "keyframe"}
 LOST = Mock(side_effect=LostObjectError("lost"))
 
 
+def check_pose(result, T, degrees=4.0, share=0.04):
+    found = errors(result, T)
+    assert found[0] < degrees
+    assert found[1] < share
+
+
+def follower(registrar=None):
+    """A follower that knows the pose in the first frame of a sequence."""
+    image, _, T = sequence(1)[0]
+    follow = Follower(registrar or truck_registrar(), CAMERA)
+    follow.start(image, T)
+    return follow
+
+
 def test_follower_keeps_the_object_over_a_sequence():
-    frames = sequence(6)
+    (image, box, T), *frames = sequence(6)
     follow = Follower(learned_registrar(), CAMERA)
-    results = [follow(image, box if k == 0 else None) for k, (image, box, _) in enumerate(frames)]
-    first = results[0].confidence
-    assert first >= BELIEVED_CONFIDENCE
-    for result, (_, _, T) in zip(results, frames, strict=True):
-        degrees, position = errors(result, T)
-        assert degrees < 4.0
-        assert position < 0.04
-        assert 0.3 < result.confidence <= first
+    first = follow(image, box)
+    check_pose(first, T)
+    assert first.confidence >= BELIEVED_CONFIDENCE
+    for image, _, T in frames:
+        result = follow(image)
+        check_pose(result, T)
+        assert 0.3 < result.confidence <= first.confidence
 
 
 def test_follower_starts_from_a_known_pose_without_registering(monkeypatch):
-    frames = sequence(4)
-    registrar = truck_registrar()
-    follow = Follower(registrar, CAMERA)
-    follow.start(frames[0][0], frames[0][2])
+    follow = follower()
     monkeypatch.setattr(tracking, "refine_one", None)  # neither search
-    monkeypatch.setattr(type(registrar), "register_prepared", None)  # nor registration
-    for image, _, T in frames[1:]:
+    monkeypatch.setattr(Registrar, "register_prepared", None)  # nor registration
+    for image, _, T in sequence(4)[1:]:
         result = follow(image)
-        degrees, position = errors(result, T)
-        assert degrees < 2.0
-        assert position < 0.02
+        check_pose(result, T, degrees=2.0, share=0.02)
         assert 0.5 < result.confidence <= 1.0
         assert torch.equal(result.transform[:3, 3], result.translation)
         assert set(result.confidence_features) == TRACKED
@@ -113,8 +122,7 @@ def test_a_pose_is_followed_if_it_is_believed_or_three_agree(
     assert follow._base == base
     if base is not None:
         result = follow(second)
-        degrees, position = errors(result, T_second)
-        assert (degrees < 4.0, position < 0.04) == (True, True)
+        check_pose(result, T_second)
         assert result.confidence <= base
         assert set(result.confidence_features) == TRACKED
 
@@ -150,14 +158,12 @@ def test_a_wrong_start_never_becomes_believed(with_box):
 def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
     """Until a registration of a later frame confirms it."""
     frames = sequence(5)
-    follow = Follower(learned_registrar(), CAMERA)
-    follow.start(frames[0][0], frames[0][2])
-    with monkeypatch.context() as patch:
-        patch.setattr(tracking, "tracking_confidence", lambda _: 0.3)
-        patch.setattr(tracking, "refine_one", LOST)
-        assert follow(frames[1][0]).confidence == pytest.approx(0.3)
+    follow = follower(learned_registrar())
     with monkeypatch.context() as patch:
         patch.setattr(tracking, "refine_one", LOST)
+        with monkeypatch.context() as doubtful:
+            doubtful.setattr(tracking, "tracking_confidence", lambda _: 0.3)
+            assert follow(frames[1][0]).confidence == pytest.approx(0.3)
         assert follow(frames[2][0]).confidence <= 0.3
     confirmed = follow(frames[3][0])
     assert confirmed.confidence > BELIEVED_CONFIDENCE
@@ -168,45 +174,36 @@ def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
 
 def test_follower_refines_where_tracking_is_doubtful(monkeypatch):
     """The object jumps by 11 degrees and a tenth of its distance."""
-    image, _, T = sequence(1)[0]
+    T = sequence(1)[0][2]
     jumped = T.clone()
     jumped[:3, :3] = rotation_from_axis_angle(double([0.0, 0.2, 0.0])) @ T[:3, :3]
     jumped[0, 3] += 0.1 * T[2, 3]
     there = synthesize_photograph(example_mesh(), jumped, CAMERA, SIZE, seeded(9))[0]
-    calls = []
-    refine_one = tracking.refine_one
     monkeypatch.setattr(tracking, "TRUSTED_CONFIDENCE", 1.1)  # whatever the tracker says
-    monkeypatch.setattr(
-        tracking, "refine_one", lambda *a, **k: calls.append(a) or refine_one(*a, **k)
-    )
-    follow = Follower(truck_registrar(), CAMERA)
-    follow.start(image, T)
-    assert errors(follow(there), jumped)[0] < 4.0
+    calls = spied(monkeypatch, tracking, "refine_one")
+    assert errors(follower()(there), jumped)[0] < 4.0
     assert len(calls) == 1
 
 
 @pytest.mark.parametrize(("tracked", "kept"), [(0.19, False), (0.21, True)])
 def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
-    frames = sequence(2)
-    follow = Follower(truck_registrar(), CAMERA)
-    follow.start(frames[0][0], frames[0][2])
+    follow = follower()
     monkeypatch.setattr(tracking, "tracking_confidence", lambda _: tracked)
     monkeypatch.setattr(tracking, "refine_one", LOST)
     answering(monkeypatch, FailedRegistration(LostObjectError("no")))
-    result = follow(frames[1][0])
+    result = follow(sequence(2)[1][0])
     assert result.ok == kept
     assert not kept or result.confidence == pytest.approx(tracked)
 
 
 @pytest.mark.parametrize(("confidence", "used"), [(0.89, False), (0.95, True)])
 def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, confidence, used):
-    frames = sequence(2)
-    follow = Follower(truck_registrar(), CAMERA)
-    follow.start(frames[0][0], frames[0][2])
+    image, box, T = sequence(2)[1]
+    follow = follower()
     monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 0.1)
     monkeypatch.setattr(tracking, "refine_one", LOST)
-    answering(monkeypatch, answer(frames[1][2], confidence))
-    result = follow(*frames[1][:2])
+    answering(monkeypatch, answer(T, confidence))
+    result = follow(image, box)
     assert result.ok == used
     assert not used or result.confidence == confidence
 
@@ -237,19 +234,12 @@ def test_a_start_needs_a_probability(confidence):
 @pytest.mark.slow
 def test_frames_below_one_half_are_checked_and_a_start_of_no_confidence_is_kept(monkeypatch):
     """What decides is the confidence that is reported: that of the start times the tracker's."""
-    frames = sequence(2)
+    (first, _, start), (second, _, T) = sequence(2)
+    calls = spied(monkeypatch, tracking, "refine_one")
+    monkeypatch.setattr(Follower, "_registered", Mock(side_effect=AssertionError("dropped")))
     for confidence, checks in ((1.0, 0), (0.45, 1), (0.0, 1)):
-        calls = []
+        calls.clear()
         follow = Follower(learned_registrar(), CAMERA)
-        follow.start(frames[0][0], frames[0][2], confidence=confidence)
-        refined = tracking.refine_one
-        monkeypatch.setattr(
-            tracking, "refine_one", lambda *a, f=refined, c=calls: (c.append(1), f(*a))[1]
-        )
-        monkeypatch.setattr(
-            follow, "_registered", lambda *_: pytest.fail("the given pose was dropped")
-        )
-        result = follow(frames[1][0])
-        monkeypatch.undo()
+        follow.start(first, start, confidence=confidence)
+        assert errors(follow(second), T)[0] < 5.0
         assert len(calls) == checks
-        assert errors(result, frames[1][2])[0] < 5.0

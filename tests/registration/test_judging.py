@@ -6,13 +6,19 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import judged
 from tests._support import CAMERA, SIZE, double, eye
-from tests._support.hypotheses import HALF_TURN, evidence_of, poses_at, turned
+from tests._support.hypotheses import (
+    HALF_TURN,
+    competing,
+    evidence_of,
+    poses_at,
+    target_of,
+    turned,
+)
 
 HULL = 0.3 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 BOX = torch.tensor([90.0, 60.0, 150.0, 120.0])
@@ -36,13 +42,13 @@ def judgement(
     distinct=None,
     outside=None,
     pipeline=None,
-    scores=None,
+    limits=None,
+    symmetries=None,
     printed=0.0,
     **changes,
 ):
-    H = len(poses)
-    target = SimpleNamespace(
-        score_weights=lambda **_: EvidenceWeights(),
+    """Of poses in a photograph that ``changes``."""
+    target = target_of(
         pipeline=pipeline or Pipeline(),
         bank=SimpleNamespace(views=SimpleNamespace(rotations=turned(0.0, 90.0, 180.0).float())),
         describer=SimpleNamespace(hull=HULL, centre=torch.zeros(3).double()),
@@ -59,10 +65,8 @@ def judgement(
         camera=CAMERA,
         pinhole=None,
     )
-    ranking = Ranking(torch.tensor([scores or [1.0, 0.5, 0.25]]), torch.arange(3)[None], {})
-    limits = changes.pop("limits", None)
-    symmetries = changes.pop("symmetries", None)
     vars(item).update(changes)
+    ranking = Ranking(torch.tensor([[1.0, 0.5, 0.25]]), torch.arange(3)[None], {})
     block = SimpleNamespace(
         exact=True,
         photographs=[item],
@@ -73,9 +77,8 @@ def judgement(
         boxes=item.box[None].double(),
         cameras=CAMERA[None],
     )
-    are_outside = torch.tensor(outside or [False] * H)
-    are_distinct = torch.tensor(distinct or [True] * H)
-    poses = replace(poses, evidence=evidence, is_outside=are_outside, is_distinct=are_distinct)
+    are_distinct = torch.tensor(distinct or [True] * len(poses))
+    poses = replace(competing(poses, evidence, outside), is_distinct=are_distinct)
     return judged(target, block, 0, poses)
 
 
@@ -129,13 +132,11 @@ def test_without_a_rival_inside_the_one_outside_is_compared(outside, margin):
 
 def test_views_up_to_symmetries_are_near():
     """Of views at 0, 90 and 180 degrees."""
-    evidence = evidence_of(0.6, 0.5)
-    poses = poses_at(0.0, 90.0)
-    plain = judgement(poses, evidence).confidence_features["ranking_share"]
-    assert plain == pytest.approx(1.0 / (1.0 + 0.5**4 + 0.25**4))
     two = torch.stack([eye(4), HALF_TURN])
-    both = judgement(poses, evidence, symmetries=two).confidence_features["ranking_share"]
-    assert both == pytest.approx((1.0 + 0.25**4) / (1.0 + 0.5**4 + 0.25**4))
+    for symmetries, near in ((None, 1.0), (two, 1.0 + 0.25**4)):
+        result = judgement(poses_at(0.0, 90.0), evidence_of(0.6, 0.5), symmetries=symmetries)
+        share = result.confidence_features["ranking_share"]
+        assert share == pytest.approx(near / (1.0 + 0.5**4 + 0.25**4))
 
 
 @pytest.mark.parametrize("siblings", [[False, True], [True, False]])

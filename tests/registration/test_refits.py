@@ -6,11 +6,16 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from curvireg_torch.evidence import EvidenceWeights
-from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import block
 from tests._support import eye
-from tests._support.hypotheses import HALF_TURN, evidence_of, poses_at
+from tests._support.hypotheses import (
+    HALF_TURN,
+    all_kept,
+    competing,
+    evidence_of,
+    poses_at,
+    target_of,
+)
 
 MOVE = 1e-3
 
@@ -47,14 +52,10 @@ class Refits:
 
     def run(self, poses, evidence, outside=None, symmetries=None):
         """Which poses moved, and the evidence."""
-        target = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), pipeline=Pipeline())
-        some = SimpleNamespace(
-            symmetries=symmetries, keeps=lambda poses: torch.ones(len(poses), dtype=torch.bool)
-        )
+        some = SimpleNamespace(symmetries=symmetries, keeps=all_kept)
         crops = None
-        excluded = torch.tensor(outside or [False] * len(poses))
-        before = replace(poses, evidence=evidence, is_outside=excluded)
-        after = block.refitted(target, some, crops, before)
+        before = competing(poses, evidence, outside)
+        after = block.refitted(target_of(), some, crops, before)
         return (after.T != poses.T).flatten(1).any(dim=1).tolist(), after.evidence
 
 
@@ -80,23 +81,20 @@ def test_the_best_pose_and_two_close_rivals_are_fitted_again(
     assert (evidence.details == 1.0).all(), "of the comparison"
 
 
-def test_results_with_a_higher_score_are_kept_and_no_others(monkeypatch):
-    refit = Refits(monkeypatch, {0: 0.89, 1: 0.79, 2: 0.85})
+@pytest.mark.parametrize(
+    ("new", "is_moved", "similarity"),
+    [
+        ({0: 0.89, 1: 0.79, 2: 0.85}, [False, False, True], [0.9, 0.8, 0.85]),
+        ({0: 0.95, 1: 0.84}, [True, True, False], [0.95, 0.84, 0.7]),
+        ({1: 0.85}, [False, True, False], [0.9, 0.85, 0.7]),
+    ],
+)
+def test_results_with_a_higher_score_are_kept_and_no_others(monkeypatch, new, is_moved, similarity):
+    """A pose that stays keeps its evidence, though it is described as 1.0, which is better."""
+    refit = Refits(monkeypatch, new)
     moved, evidence = refit.run(poses_at(0.0, 90.0, 180.0), evidence_of(0.9, 0.8, 0.7))
-    assert moved == [False, False, True]
-    assert evidence.similarity.tolist() == pytest.approx([0.9, 0.8, 0.85])
-    refit = Refits(monkeypatch, {0: 0.95, 1: 0.84})
-    moved, evidence = refit.run(poses_at(0.0, 90.0, 180.0), evidence_of(0.9, 0.8, 0.7))
-    assert moved == [True, True, False]
-    assert evidence.similarity.tolist() == pytest.approx([0.95, 0.84, 0.7])
-
-
-def test_a_pose_that_stays_keeps_its_evidence(monkeypatch):
-    """It is described as 1.0, which would be better."""
-    refit = Refits(monkeypatch, {1: 0.85})
-    moved, evidence = refit.run(poses_at(0.0, 90.0, 180.0), evidence_of(0.9, 0.8, 0.7))
-    assert moved == [False, True, False]
-    assert evidence.similarity.tolist() == pytest.approx([0.9, 0.85, 0.7])
+    assert moved == is_moved
+    assert evidence.similarity.tolist() == pytest.approx(similarity)
 
 
 def test_symmetric_poses_are_no_rivals(monkeypatch):

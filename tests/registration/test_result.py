@@ -19,14 +19,13 @@ def test_to_dict_replaces_unbounded_deviations_by_null():
     """Unbounded from one radian, and from half the distance."""
     variances = double([0.25, 0.81, 1.21, 0.81, 0.9801, 1.0201])
     document = registration(torch.diag(variances)).to_dict()
-    degrees = 180.0 / torch.pi
-    deviations = document["standard_deviations"]
-    assert deviations["rotation_deg"] == [
-        pytest.approx(0.5 * degrees),
-        pytest.approx(0.9 * degrees),
-        None,
-    ]
-    assert deviations["translation"] == [pytest.approx(0.9), pytest.approx(0.99), None]
+    for name, known in (
+        ("rotation_deg", [math.degrees(0.5), math.degrees(0.9)]),
+        ("translation", [0.9, 0.99]),
+    ):
+        *some, unknown = document["standard_deviations"][name]
+        assert some == pytest.approx(known)
+        assert unknown is None
     json.dumps(document, allow_nan=False)
 
 
@@ -34,33 +33,33 @@ def test_a_questionable_answer_is_unsure_and_an_improbable_one_no_match():
     # A high confidence that is not reliable, because of a questionable camera, is no reason to be
     # sure.
     sure = replace(registration(covariance=0.01 * eye(6)), probabilities=(0.95,))
-    doubtful = replace(sure, warnings=("the camera is questionable",))
-    assert (sure.verdict, doubtful.verdict) == ("reliable", "unsure")
-    for probabilities, word in (
-        ((0.4, 0.21), "unsure"),
-        ((0.4, 0.19), "no match"),
-        ((0.5,), "unsure"),
-        ((), "unsure"),
+    for changes, word in (
+        ({}, "reliable"),
+        ({"warnings": ("the camera is questionable",)}, "unsure"),
+        ({"probabilities": (0.4, 0.21)}, "unsure"),
+        ({"probabilities": (0.4, 0.19)}, "no match"),
+        ({"probabilities": (0.5,)}, "unsure"),
+        ({"probabilities": ()}, "unsure"),
     ):
-        assert replace(sure, probabilities=probabilities).verdict == word
+        assert replace(sure, **changes).verdict == word
+
+
+LOST = FailedRegistration(LostObjectError("not found"))
 
 
 def test_photographs_without_a_pose_have_a_verdict_too():
-    lost = FailedRegistration(LostObjectError("not found"))
     failed = FailedRegistration(InvalidInputError("no such file"))
-    assert (lost.verdict, failed.verdict) == ("lost", "failed")
+    assert (LOST.verdict, failed.verdict) == ("lost", "failed")
 
 
 def test_what_no_registration_has_a_photograph_without_a_pose_has_neither():
-    lost = FailedRegistration(LostObjectError("not found"))
-    assert not hasattr(lost, "foo")
-    assert getattr(lost, "foo", 7) == 7
-    assert not hasattr(lost, "_repr_html_"), "notebooks ask for it"
+    assert getattr(LOST, "foo", 7) == 7
+    assert not hasattr(LOST, "_repr_html_"), "notebooks ask for it"
     with refused("'FailedRegistration' object has no attribute 'foo'", AttributeError):
-        lost.foo  # noqa: B018
+        LOST.foo  # noqa: B018
     for name in ("rotation", "confidence", "reliable", "to_dict"):
         with refused("not found", LostObjectError):
-            getattr(lost, name)
+            getattr(LOST, name)
 
 
 def test_the_confidence_is_shown_rounded_down():
@@ -84,21 +83,19 @@ def seen_at(*degrees):
 
 
 def test_ambiguity():
-    azimuths = (10.0,), (10.0, 190.0), (40.0, 320.0), (40.0, 100.0), (0.0, 120.0, 240.0)
-    assert [ambiguity(turned(*some)) for some in azimuths] == [
-        None,
-        "half turn",
-        "mirror",
-        "several",
-        "several",
-    ]
+    for azimuths, word in (
+        ((10.0,), None),
+        ((10.0, 190.0), "half turn"),
+        ((40.0, 320.0), "mirror"),
+        ((40.0, 100.0), "several"),
+        ((0.0, 120.0, 240.0), "several"),
+    ):
+        assert ambiguity(turned(*azimuths)) == word
     # Rivals that are half as probable:
     for second, word in ((0.31, "mirror"), (0.29, None)):
         result = replace(seen_at(40.0, 320.0), probabilities=(0.6, second))
-        assert (result.ambiguous, result.no_match_probability) == (
-            word,
-            pytest.approx(0.4 - second),
-        )
+        assert result.ambiguous == word
+        assert result.no_match_probability == pytest.approx(0.4 - second)
 
 
 @pytest.mark.parametrize(
@@ -158,12 +155,10 @@ def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_dete
 
 def test_a_rotation_that_is_not_determined_is_not_reliable():
     sure = with_each(registration(covariance=1e-4 * eye(6), confidence=0.95), edge_support=0.6)
-    for undetermined, is_reliable in ((0.99, True), (1.0, False)):
-        result = replace(sure, confidence_features={"undetermined": undetermined})
-        assert result.reliable == is_reliable
-        assert result.verdict == ("reliable" if is_reliable else "unsure")
     # of a nearly round object it may be the turn about its axis, which is reliable by itself
-    nearly_round = replace(sure, axis=Axis(torch.eye(3)[2].double(), 0.95))
-    for undetermined, verdict in ((0.99, "reliable"), (1.0, "reliable axis")):
-        features = {"undetermined": undetermined}
-        assert replace(nearly_round, confidence_features=features).verdict == verdict
+    nearly_round = replace(sure, axis=Axis(eye(3)[2], 0.95))
+    for result, otherwise in ((sure, "unsure"), (nearly_round, "reliable axis")):
+        for undetermined, verdict in ((0.99, "reliable"), (1.0, otherwise)):
+            judged = replace(result, confidence_features={"undetermined": undetermined})
+            assert judged.reliable == (verdict == "reliable")
+            assert judged.verdict == verdict

@@ -16,6 +16,7 @@ from curvireg_torch.synthetic import example_mesh, procedural_background, synthe
 from tests._support import (
     CAMERA,
     SIZE,
+    answer_of,
     double,
     eye,
     learned_registrar,
@@ -61,6 +62,19 @@ def registered(images, boxes, cameras):
     return registrar().register_views(images, boxes, CAMERA, cameras)
 
 
+def first_of(count):
+    """The first photographs of ``EASY``, with boxes and cameras."""
+    return [part[:count] for part in rig_of(EASY)]
+
+
+@cache
+def beside():
+    """A fourth photograph, its box, and a camera that looks the other way."""
+    image, box, T = photograph(60.0, 4, 0.1)
+    camera = T @ torch.linalg.inv(WORLD)
+    return image, box, camera, transform(HALF_TURN, torch.zeros(3).double()) @ first_of(1)[2]
+
+
 def check_pose(result, *, degrees=2.0, shift=0.1):
     """``T_world_from_model`` is right, ``shift`` in radii."""
     assert rotation_error(result.rotation, WORLD[:3, :3]) < degrees
@@ -97,12 +111,13 @@ def easy(easy_and_fits):
 @pytest.fixture(scope="module")
 def first():
     """The first photograph of ``easy``, as a rig."""
-    return registered(*(part[:1] for part in rig_of(EASY)))
+    return registered(*first_of(1))
 
 
 def test_pose_in_the_world_and_in_each_photograph(easy):
     check_pose(easy, degrees=1.0, shift=0.05)
-    for view, camera, box in zip(easy.views, rig_of(EASY)[2], rig_of(EASY)[1], strict=True):
+    _, boxes, cameras = rig_of(EASY)
+    for view, camera, box in zip(easy.views, cameras, boxes, strict=True):
         assert_close(view.T_cam_from_model, camera @ easy.transform)
         assert view.box.tolist() == box.tolist()
         assert view.failure is None
@@ -142,36 +157,32 @@ def test_the_joint_fit_begins_at_each_pose_and_where_a_coarse_fit_moves_it(easy_
 @pytest.mark.slow
 def test_photographs_that_fail_are_reported_and_change_nothing(easy, tmp_path):
     images, boxes, cameras = rig_of(EASY)
-    other, box, T = photograph(60.0, 4, 0.1)
+    other, box, camera, away = beside()
     empty = procedural_background(SIZE, seeded(5))
-    more = torch.stack(
-        [T @ torch.linalg.inv(WORLD), photograph(220.0, 4, 0.1)[2] @ torch.linalg.inv(WORLD)]
-    )
-    away = transform(HALF_TURN, torch.zeros(3).double()) @ cameras[:1]  # looks the other way
+    there = photograph(220.0, 4, 0.1)[2] @ torch.linalg.inv(WORLD)
     result = registered(
         [*images, empty, tmp_path / "none.png", other],
         [*boxes, box, box, box],
-        torch.cat([cameras, more, away]),
+        torch.cat([cameras, camera[None], there[None], away]),
     )
     assert [view.failure is None for view in result.views] == [True] * 3 + [False] * 3
-    assert "not seen where" in result.views[3].failure or "lies outside" in result.views[3].failure
-    assert "no such file" in result.views[4].failure
-    assert result.views[4].box is None
-    assert result.views[3].contribution == result.views[4].contribution == 0
+    empty, unread = result.views[3:5]
+    assert "not seen where" in empty.failure or "lies outside" in empty.failure
+    assert "no such file" in unread.failure
+    assert unread.box is None
+    assert empty.contribution == unread.contribution == 0
     assert_close(result.transform, easy.transform, atol=1e-6, rtol=0)
-    assert_close(result.views[4].T_cam_from_model, more[1] @ easy.transform, atol=1e-6, rtol=0)
-    shown = registered([images[0], other], [boxes[0], box], torch.stack([cameras[0], more[0]]))
+    assert_close(unread.T_cam_from_model, there @ easy.transform, atol=1e-6, rtol=0)
+    shown = registered([images[0], other], [boxes[0], box], torch.stack([cameras[0], camera]))
     assert all(view.failure is None for view in shown.views)
 
 
 @pytest.mark.slow
 def test_boxes_may_be_missing():
     images, boxes, cameras = rig_of(EASY)
-    other = photograph(60.0, 4, 0.1)[0]
-    away = transform(HALF_TURN, torch.zeros(3).double()) @ cameras[:1]  # looks the other way
-    result = registered(
-        [*images, other], [boxes[0], None, boxes[2], None], torch.cat([cameras, away])
-    )
+    other, _, _, away = beside()
+    some = [boxes[0], None, boxes[2], None]
+    result = registered([*images, other], some, torch.cat([cameras, away]))
     check_pose(result, degrees=1.0, shift=0.05)
     assert result.views[1].failure is None
     assert (result.views[1].box - boxes[1]).abs().max() < 8
@@ -185,16 +196,16 @@ def test_without_any_box_the_object_is_searched_for():
 
 
 def test_one_photograph_gives_the_answer_of_the_registrar(first):
-    images, boxes, cameras = (part[:1] for part in rig_of(EASY))
-    alone = registrar()(images, torch.stack(boxes), CAMERA)[0]
-    assert_close(cameras[0] @ first.transform, alone.transform)
+    (image,), (box,), (camera,) = first_of(1)
+    alone = answer_of(registrar(), image, box)
+    assert_close(camera @ first.transform, alone.transform)
     assert first.probabilities == alone.probabilities
-    R = cameras[0, :3, :3]
+    R = camera[:3, :3]
     assert_close(R @ first.covariance[3:, 3:] @ R.T, alone.covariance[3:, 3:])
 
 
 def test_covariance_shrinks_with_photographs(first, easy):
-    two = registered(*(part[:2] for part in rig_of(EASY)))
+    two = registered(*first_of(2))
     one, both, three = (
         torch.linalg.eigvalsh(r.hypotheses[0].covariance[3:, 3:]).sqrt() for r in (first, two, easy)
     )
@@ -223,30 +234,20 @@ def test_a_motion_of_the_world_moves_the_answer(easy):
     assert moved.confidence == pytest.approx(easy.confidence, abs=1e-3)
 
 
-def in_another_unit(T, factor):
-    return transform(T[:, :3, :3], factor * T[:, :3, 3])
-
-
 def test_bad_rigs_name_the_photograph():
-    for change, message in (
-        (
-            lambda T: in_another_unit(T, 1000.0),
-            "image 0: T_cam_from_world: by its size .* mesh's unit",
-        ),
-        (lambda T: T[[0, 1, 1]], "image 2 and image 1: T_cam_from_world: the same, but"),
-        (
-            lambda T: torch.cat([T[:1], 1.1 * T[1:2], T[2:]]),
-            "image 1: T_cam_from_world: expected rigid",
-        ),
-        (
-            lambda T: T.index_fill(0, torch.tensor([2]), torch.nan),
-            "image 2: T_cam_from_world: expected finite",
-        ),
-        (lambda T: T[:2], r"T_cam_from_world: expected shape \(3, 4, 4\)"),
+    images, boxes, cameras = rig_of(EASY)
+    in_mm = transform(cameras[:, :3, :3], 1000.0 * cameras[:, :3, 3])
+    larger = cameras * double([1.0, 1.1, 1.0])[:, None, None]
+    missing = cameras.index_fill(0, torch.tensor([2]), torch.nan)
+    for wrong, message in (
+        (in_mm, "image 0: T_cam_from_world: by its size .* mesh's unit"),
+        (cameras[[0, 1, 1]], "image 2 and image 1: T_cam_from_world: the same, but"),
+        (larger, "image 1: T_cam_from_world: expected rigid"),
+        (missing, "image 2: T_cam_from_world: expected finite"),
+        (cameras[:2], r"T_cam_from_world: expected shape \(3, 4, 4\)"),
     ):
-        images, boxes, cameras = rig_of(EASY)
         with refused(message):
-            registered(images, boxes, change(cameras))
+            registered(images, boxes, wrong)
     with refused(r"no photograph can be registered: image 0: .*one colour"):
         registered([torch.zeros(3, *SIZE)], boxes[:1], cameras[:1])
     with refused(r"boxes: expected shape \(3, 4\)"):

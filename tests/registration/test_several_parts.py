@@ -20,10 +20,9 @@ ANY_RIGHT = 0.8
 EYE = eye(4)
 
 
-def photograph(index, **changes):
+def photograph(index, *, angle=0.0, ranking_share=0.5, **changes):
     """A photograph that was registered alone, with a ``confidence`` and an ``angle`` from the joint
     pose."""
-    features = {"ranking_share": changes.pop("ranking_share", 0.5)}
     result = {
         "confidence": 0.5,
         "probabilities": (0.5,),
@@ -31,20 +30,16 @@ def photograph(index, **changes):
         "warnings": (),
         "notes": (),
         "ranking": None,
-        "confidence_features": features,
+        "confidence_features": {"ranking_share": ranking_share},
     }
-    angle = changes.pop("angle", 0.0)
-    result |= changes
+    box = torch.tensor([10.0, 10.0, 50.0, 50.0])
     return SimpleNamespace(
         index=index,
-        angle=angle,
-        result=SimpleNamespace(**result),
+        result=SimpleNamespace(**result | changes),
         poses=torch.full((2, 4, 4), angle),
         camera=EYE,
         printed=lambda _: 0.0,
-        photograph=SimpleNamespace(
-            K=eye(3), size=(100, 200), box=torch.tensor([10.0, 10.0, 50.0, 50.0])
-        ),
+        photograph=SimpleNamespace(K=eye(3), size=(100, 200), box=box),
     )
 
 
@@ -156,9 +151,8 @@ def test_photographs_that_are_confident_of_another_pose_lower_the_odds(
     scores = SCORES | {2: [1.0, 5.0, 1.0]}
     result = joint(monkeypatch, two() | {2: other}, scores, missing={2: "elsewhere"})
     odds = factor * TOGETHER[0] / (1.0 - TOGETHER[0])
-    assert result.probabilities[0] == pytest.approx(odds / (1.0 + odds))
-    ratio = result.probabilities[0] / TOGETHER[0]
-    assert result.probabilities[1:] == pytest.approx([ratio * p for p in TOGETHER[1:]])
+    ratio = odds / (1.0 + odds) / TOGETHER[0]
+    assert result.probabilities == pytest.approx([ratio * p for p in TOGETHER])
     assert [view.failure for view in result.views] == [None, None, "elsewhere"]
     assert [view.contribution for view in result.views] == [2.0, 1.0, 0.0]
 
@@ -175,9 +169,7 @@ def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
     first = photograph(0, ranking_share=0.2, warnings=("b", "a", "own"))
     second = photograph(1, ranking_share=None, warnings=("a", "b"))
     third = photograph(2, ranking_share=0.6, warnings=("b", "x", "a"))
-    first.photograph.size = (100, 200)
     second.photograph.size = (300, 200)
-    third.photograph.size = (100, 200)
     second.photograph.box = torch.tensor([-0.5, 10.0, 199.5, 50.0])
     second.printed = lambda _: 3.5
     found = {0: first, 1: second, 2: third}

@@ -16,7 +16,7 @@ from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import Siblings
 from curvireg_torch.registration.target import TellingSymmetries
 from tests._support import double, eye
-from tests._support.hypotheses import evidence_of, poses_at
+from tests._support.hypotheses import competing, evidence_of, poses_at, target_of
 
 
 def four(similarity, compare, angles):
@@ -69,30 +69,24 @@ def test_siblings_that_look_alike_are_rivals_if_the_hidden_feature_is_notable():
     assert is_hidden
 
 
-def turns_about_z(count):
-    angles = torch.arange(count).double() * (2.0 * math.pi / count)
-    R = rotation_from_axis_angle(angles[:, None] * double([0.0, 0.0, 1.0]))
-    return transform(R, torch.zeros(count, 3).double())
-
-
 class Case:
     """A pose at 0 degrees that lies outside the limits, the best at 40, and another at 80; three
     siblings of the best have the similarities ``measured``, a sibling that is fitted 0.95."""
 
     def __init__(self, monkeypatch, measured):
         self.fitted: list[Hypotheses] = []
-        self.symmetries = turns_about_z(3)
+        angles = double([0.0, 1.0, 2.0])[:, None] * double([0.0, 0.0, 2.0 * math.pi / 3.0])
+        self.symmetries = transform(rotation_from_axis_angle(angles), torch.zeros(3, 3).double())
         self.poses = four([0.0] * 3, [[0.0] * 3] * 3, [0, 40, 80]).poses
         different = ~torch.eye(3, dtype=torch.bool)
         monkeypatch.setattr(judging, "fitted_poses", self.fit)
         monkeypatch.setattr(judging, "by_contours", lambda *_: torch.arange(3))
         monkeypatch.setattr(judging, "compared", lambda _: (torch.zeros(3, 3).double(), different))
+        evidence = {3: evidence_of(*measured), 1: evidence_of(0.95)}
         monkeypatch.setattr(
             judging,
             "with_evidence",
-            lambda _, __, poses: replace(
-                poses, evidence=evidence_of(*measured) if len(poses) == 3 else evidence_of(0.95)
-            ),
+            lambda _, __, poses: replace(poses, evidence=evidence[len(poses)]),
         )
 
     def fit(self, target, block, crops, starts, *, refit):
@@ -104,19 +98,16 @@ class Case:
 
     def run(self, keeps=None):
         """``keeps``: what the limits say, one call after the other."""
-        target = SimpleNamespace(
+        target = target_of(
             telling_symmetries=TellingSymmetries(self.symmetries),
             describer=SimpleNamespace(device_contours=None, centre=torch.zeros(3).double()),
-            score_weights=lambda **_: EvidenceWeights(),
         )
         answers = iter(keeps or [])
         block = MagicMock()
         block.__len__.return_value = 1
         block.keeps = lambda poses: torch.tensor([next(answers, True)] * len(poses))
         crops = None
-        outside = torch.tensor([True, False, False])
-        given = evidence_of(0.99, 0.9, 0.5)
-        before = replace(self.poses, evidence=given, is_outside=outside)
+        before = competing(self.poses, evidence_of(0.99, 0.9, 0.5), [True, False, False])
         after, rival, _ = judging.with_siblings(target, block, crops, before)
         assert not rival.is_outside.any()
         assert rival.is_sibling.all()

@@ -8,17 +8,15 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.fitting.focal_length import USUAL_FOCAL, FocalInformation, scaled_cameras
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import Camera
 from curvireg_torch.geometry.cameras import point_in_cameras
-from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.photograph import Photograph
 from tests._support import CAMERA, SIZE, double, refused
 from tests._support import hypotheses as support
-from tests._support.hypotheses import evidence_of
+from tests._support.hypotheses import all_kept, competing, evidence_of, target_of
 
 NOTHING = None
 CENTRE = double([0.3, -0.2, 0.4])
@@ -48,12 +46,10 @@ def test_cameras_that_are_tried_have_all_fields_of_view():
 
 
 def test_the_angle_to_the_centre_of_the_box():
-    K = CAMERA.clone()
     box = torch.tensor([119.5 + 100, 89.5 - 20, 119.5 + 160, 89.5 + 20])
-    item = Photograph(torch.zeros(3, *SIZE), box, Camera(K))
-    assert camera_module.off_axis_angle(item) == pytest.approx(
-        math.degrees(math.atan(130.0 / 260.0))
-    )
+    item = Photograph(torch.zeros(3, *SIZE), box, Camera(CAMERA))
+    expected = math.degrees(math.atan(130.0 / 260.0))
+    assert camera_module.off_axis_angle(item) == pytest.approx(expected)
 
 
 def test_starts_are_the_best_view_of_each_camera_and_the_best_views():
@@ -125,7 +121,7 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
     assert_close(covariance[0], variance * expected[:, None] * expected, atol=1e-6, rtol=1e-4)
 
 
-def refitted(monkeypatch, evidence, new, *, tried_cameras, outside=None):
+def refitted(monkeypatch, evidence, new, *, tried_cameras=True, outside=None):
     """Views that were fitted with their focal lengths, those that changed, and the evidence."""
     poses = poses_at(len(evidence))
     tried = []
@@ -139,19 +135,14 @@ def refitted(monkeypatch, evidence, new, *, tried_cameras, outside=None):
 
     monkeypatch.setattr(camera_module, "with_focal_length", fit)
     monkeypatch.setattr(camera_module, "with_evidence", measure)
-    target = SimpleNamespace(
-        score_weights=lambda **_: EvidenceWeights(),
-        describer=SimpleNamespace(centre=CENTRE),
-        pipeline=Pipeline(),
-    )
+    target = target_of(describer=SimpleNamespace(centre=CENTRE))
     block = SimpleNamespace(
         tried_cameras=torch.tensor([tried_cameras]),
         photographs=[SimpleNamespace(focal_deviation=0.1)],
         symmetries=None,
-        keeps=lambda some: torch.ones(len(some), dtype=torch.bool),
+        keeps=all_kept,
     )
-    excluded = torch.tensor(outside or [False] * len(poses))
-    before = replace(poses, evidence=evidence, is_outside=excluded)
+    before = competing(poses, evidence, outside)
     after = camera_module.with_fitted_focal_lengths(target, block, NOTHING, before)
     differ = (after.cameras != poses.cameras).flatten(1).any(dim=1)
     return tried, differ.nonzero()[:, 0].tolist(), after.evidence
@@ -161,17 +152,15 @@ def test_fitted_focal_lengths_may_lower_scores_a_little(monkeypatch):
     """By 0.2, which is 0.02 of similarity."""
     evidence = evidence_of(0.6, 0.9, 0.8)
     new = {0: 0.6, 1: 0.885, 2: 0.775}
-    tried, changed, after = refitted(monkeypatch, evidence, new, tried_cameras=True)
+    tried, changed, after = refitted(monkeypatch, evidence, new)
     assert (tried, changed) == ([1, 2], [1])
     assert after.similarity.tolist() == pytest.approx([0.6, 0.885, 0.8])
     assert refitted(monkeypatch, evidence, new, tried_cameras=False)[0] == [1], "of a known camera"
-    excluded = [False, True, False]
-    tried, changed, _ = refitted(monkeypatch, evidence, new, tried_cameras=True, outside=excluded)
+    tried, changed, _ = refitted(monkeypatch, evidence, new, outside=[False, True, False])
     assert (tried, changed) == ([2, 0], [0])
-    excluded = [True, True, False]
-    assert refitted(monkeypatch, evidence, new, tried_cameras=True, outside=excluded)[0] == [2]
+    assert refitted(monkeypatch, evidence, new, outside=[True, True, False])[0] == [2]
     close = evidence_of(0.7, 0.9, 0.8)
-    assert refitted(monkeypatch, close, new, tried_cameras=True)[0] == [1, 2, 0], "a close rival"
+    assert refitted(monkeypatch, close, new)[0] == [1, 2, 0], "a close rival"
 
 
 def test_fits_also_begin_from_the_focal_length_of_another_pose():
@@ -198,9 +187,8 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
     )
     best = torch.full((1, 6, 6), 2.0).double()
     monkeypatch.setattr(camera_module, "focal_covariance", lambda *_: (best, 0.07))
-    target = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), describer=None)
-    cameras = Camera(CAMERA, focal_deviation=0.1), Camera(CAMERA)
-    items = [photographed(camera) for camera in cameras]
+    target = target_of(describer=None)
+    items = [photographed(Camera(CAMERA, focal_deviation=f)) for f in (0.1, 0.0)]
     block = SimpleNamespace(photographs=items, with_photographs=dict.items)
     ((p, item),), after = camera_module.with_focal_deviation(target, block, NOTHING, poses)
     assert p == 0
@@ -212,25 +200,19 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
 
 
 def test_limits_of_an_unknown_camera_are_wider_by_how_far_the_box_is_off_the_axis(monkeypatch):
-    made = []
-
     def limits(item, _, off_centre=0.0):
-        made.append((item.camera and item.K, off_centre))
-        return "limits"
+        return item, off_centre
 
     monkeypatch.setattr(camera_module, "Limits", limits)
-    prior = SimpleNamespace(distance=None)
-    known = photographed(Camera(CAMERA), prior)
+    known = photographed(Camera(CAMERA), SimpleNamespace(distance=None))
     unknown = replace(known, camera=None)
     target = SimpleNamespace(bank=None, is_exact=True)
     similar = SimpleNamespace(bank=None, is_exact=False)
-    for one, item in ((target, known), (target, unknown), (similar, unknown)):
-        assert camera_module.limits_of(one, item) == "limits"
-    (first, none), (usual, off), (last, also_none) = made
-    assert torch.equal(first, CAMERA)
-    assert (none, also_none, last) == (0.0, 0.0, None)
-    assert torch.equal(usual, camera_module.usual_camera(SIZE))
-    assert off == pytest.approx(camera_module.off_axis_angle(known.by(usual)))
+    for one, item in ((target, known), (similar, unknown)):
+        assert camera_module.limits_of(one, item) == (item, 0.0)
+    usual, off = camera_module.limits_of(target, unknown)
+    assert torch.equal(usual.K, camera_module.usual_camera(SIZE))
+    assert off == pytest.approx(camera_module.off_axis_angle(usual))
     with_distance = SimpleNamespace(distance=(1.0, 2.0))
     with refused("distance"):
         camera_module.limits_of(similar, replace(unknown, prior=with_distance))
