@@ -9,6 +9,10 @@ import scipy.io
 import trimesh
 
 HALF = 0.25  # half the edge of the cube that all meshes are
+VIEW = {"azimuth_coarse": 45.0, "elevation_coarse": 15.0, "azimuth": 30.0, "elevation": 10.0}
+VIEW |= {"distance": 40.0, "focal": 1.0, "px": 41.0, "py": 31.0, "theta": -5.0}
+VIEW |= {"error": np.nan, "viewport": 3000.0}
+EMPTY = np.empty((0, 0))
 
 
 def write_image(path, size=(60, 80), seed=0):
@@ -27,34 +31,19 @@ def write_mesh(path, half=HALF):
 
 def pascal_object(category, **changes):
     """One entry of ``record.objects``; ``viewpoint`` is merged, other changes replace."""
-    view = {
-        "azimuth_coarse": 45.0,
-        "elevation_coarse": 15.0,
-        "azimuth": 30.0,
-        "elevation": 10.0,
-        "distance": 40.0,
-    }
-    view |= {
-        "focal": 1.0,
-        "px": 41.0,
-        "py": 31.0,
-        "theta": -5.0,
-        "error": np.nan,
-        "viewport": 3000.0,
-    }
     entry = {"class": category, "view": "", "truncated": 0, "occluded": 0, "difficult": 0}
     entry |= {"bbox": np.array([[11.0, 6.0, 71.0, 56.0]]), "cad_index": 1}
-    entry["anchors"] = {"left_front": {"location": np.empty((0, 0)), "status": 1}}
+    entry["anchors"] = {"left_front": {"location": EMPTY, "status": 1}}
     viewpoint = changes.pop("viewpoint", {})
-    entry["viewpoint"] = {**view, **viewpoint} if isinstance(viewpoint, dict) else viewpoint
-    return {**entry, **changes}
+    entry["viewpoint"] = VIEW | viewpoint if isinstance(viewpoint, dict) else viewpoint
+    return entry | changes
 
 
 def _struct_array(objects):
     keys = list(dict.fromkeys(key for entry in objects for key in entry))
     array = np.empty((1, len(objects)), dtype=[(key, object) for key in keys])
     for i, entry in enumerate(objects):
-        array[0, i] = tuple(entry.get(key, np.empty((0, 0))) for key in keys)
+        array[0, i] = tuple(entry.get(key, EMPTY) for key in keys)
     return array
 
 
@@ -63,7 +52,7 @@ def write_record(path, objects):
     record = {
         "filename": f"{path.stem}.jpg",
         "imgsize": np.array([[80, 60, 3]]),
-        "objects": _struct_array(objects) if objects else np.empty((0, 0)),
+        "objects": _struct_array(objects) if objects else EMPTY,
     }
     scipy.io.savemat(path, {"record": record}, do_compression=True)
 
@@ -74,39 +63,35 @@ def write_pascal3d(root, part="pascal"):
     annotations = root / "Annotations" / f"car_{part}"
     images = root / "Images" / f"car_{part}"
     suffix = ".jpg" if part == "pascal" else ".JPEG"
-    unset = {"azimuth": 0.0, "elevation": 0.0, "distance": 0.0, "theta": 0.0}
-    empty = np.empty((0, 0))
+    turned = {"occluded": 1, "difficult": 1, "viewpoint": {"azimuth": 300.0, "theta": 12.0}}
+    last = [
+        {"viewpoint": dict.fromkeys(("azimuth", "elevation", "distance", "theta"), 0.0)},
+        {"viewpoint": dict.fromkeys(("azimuth", "elevation", "distance"), EMPTY)},
+        {"viewpoint": EMPTY},
+        {"bbox": np.array([[20.0, 20.0, 20.0, 40.0]])},
+        {"bbox": np.array([[20.0, 20.0, np.nan, 40.0]])},
+        {"bbox": EMPTY},
+        {"cad_index": 7},
+        {"cad_index": EMPTY},
+        {"bbox": np.array([[1.0, 1.0, 9.0, 5.0]])},
+        {"viewpoint": {"distance": -4.0}},
+    ]
     records = {
         "2008_000001": [pascal_object("car")],
         "2008_000002": [
             pascal_object("sofa"),
             pascal_object("car", truncated=1, viewpoint={"azimuth": 200.0}),
-            pascal_object(
-                "car", occluded=1, difficult=1, viewpoint={"azimuth": 300.0, "theta": 12.0}
-            ),
+            pascal_object("car", **turned),
         ],
-        "2008_000003": [
-            pascal_object("car", viewpoint=unset),
-            pascal_object(
-                "car", viewpoint={"azimuth": empty, "elevation": empty, "distance": empty}
-            ),
-            pascal_object("car", viewpoint=empty),
-            pascal_object("car", bbox=np.array([[20.0, 20.0, 20.0, 40.0]])),
-            pascal_object("car", bbox=np.array([[20.0, 20.0, np.nan, 40.0]])),
-            pascal_object("car", bbox=empty),
-            pascal_object("car", cad_index=7),
-            pascal_object("car", cad_index=empty),
-            pascal_object("car", bbox=np.array([[1.0, 1.0, 9.0, 5.0]])),
-            pascal_object("car", viewpoint={"distance": -4.0}),
-        ],
+        "2008_000003": [pascal_object("car", **changes) for changes in last],
         "2008_000004": [],
     }
     for seed, (name, objects) in enumerate(records.items()):
         write_record(annotations / f"{name}.mat", objects)
         write_image(images / (name + suffix), seed=seed)
     # 6: without annotation
-    for name in ("2008_000005", "2008_000006", "2008_000007", "2008_000008"):
-        write_image(images / (name + suffix))
+    for number in range(5, 9):
+        write_image(images / f"2008_00000{number}{suffix}")
     annotations.joinpath("2008_000005.mat").write_bytes(b"MATLAB 5.0 MAT-file".ljust(200, b"\xff"))
     whole = annotations.joinpath("2008_000001.mat").read_bytes()
     annotations.joinpath("2008_000007.mat").write_bytes(whole[: len(whole) // 2])
@@ -129,12 +114,8 @@ def write_pascal3d(root, part="pascal"):
         lists.joinpath("car_imagenet_val.txt").write_text("\n".join(cars) + "\n")
         lists.joinpath("sofa_imagenet_val.txt").write_text("2008_000002\n")
     reasons = {"other_class": 3, "coarse_viewpoint": 2, "no_viewpoint": 1, "bad_box": 3}
-    return reasons | {
-        "missing_mesh": 2,
-        "corrupt_annotation": 4,
-        "missing_annotation": 1,
-        "missing_image": 1,
-    }
+    reasons |= {"missing_mesh": 2, "corrupt_annotation": 4}
+    return reasons | {"missing_annotation": 1, "missing_image": 1}
 
 
 def write_bop(root):
@@ -142,12 +123,8 @@ def write_bop(root):
     counted."""
     R = [1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]
     pose = {"cam_R_m2c": R, "cam_t_m2c": [1.0, 2.0, 400.0], "obj_id": 1}
-    info = {
-        "bbox_obj": [-5, 4, 30, 20],
-        "bbox_visib": [0, 4, 25, 20],
-        "px_count_all": 500,
-        "visib_fract": 0.8,
-    }
+    info = {"bbox_obj": [-5, 4, 30, 20], "bbox_visib": [0, 4, 25, 20]}
+    info |= {"px_count_all": 500, "visib_fract": 0.8}
     K = {"cam_K": [300.0, 0.0, 40.0, 0.0, 310.0, 30.0, 0.0, 0.0, 1.0], "depth_scale": 1.0}
     hidden = {**info, "bbox_visib": [-1, -1, -1, -1], "visib_fract": 0.0}
     one = root / "test" / "000001"
@@ -156,11 +133,8 @@ def write_bop(root):
     three = [pose, {**pose, "obj_id": 2}, {**pose, "cam_t_m2c": [9.0, 2.0, 400.0]}]
     ground_truth = {"0": three, "3": bad, **{key: [pose] for key in "45x"}}
     outside = {**info, "bbox_obj": [-1, -1, -1, -1]}
-    infos = {
-        "0": [info, hidden, {**info, "visib_fract": 0.9}],
-        "3": [info] * 5 + [outside, info],
-        "4": [info],
-    }
+    infos = {"0": [info, hidden, {**info, "visib_fract": 0.9}], "4": [info]}
+    infos["3"] = [info] * 5 + [outside, info]
     cameras = dict.fromkeys(("0", "3", "4"), K)  # 5: without camera
     for name, content in (("gt", ground_truth), ("camera", cameras), ("gt_info", infos)):
         write_json(one / f"scene_{name}.json", content)
@@ -177,20 +151,15 @@ def write_bop(root):
     root.joinpath("test", "000004").mkdir()
     for obj_id in (1, 2, 9):
         write_mesh(root / "models" / f"obj_{obj_id:06d}.ply", half=25.0)
-    entry = {
-        "diameter": 86.6,
-        "symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]],
-    }
-    write_json(root / "models" / "models_info.json", {"1": entry, "2": {"diameter": 86.6}})
-    write_json(
-        root / "camera.json",
-        {"fx": 300.0, "fy": 310.0, "cx": 40.0, "cy": 30.0, "width": 80, "height": 60},
-    )
-    targets = [(1, 0, 1), (2, 7, 1), (1, 6, 1)]  # the last is nowhere
-    write_json(
-        root / "test_targets_bop19.json",
-        [{"scene_id": s, "im_id": i, "obj_id": o, "inst_count": 1} for s, i, o in targets],
-    )
+    plain = {"diameter": 86.6}
+    half_turn = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    models = {"1": {**plain, "symmetries_discrete": [half_turn]}, "2": plain}
+    write_json(root / "models" / "models_info.json", models)
+    camera = {"fx": 300.0, "fy": 310.0, "cx": 40.0, "cy": 30.0, "width": 80, "height": 60}
+    write_json(root / "camera.json", camera)
+    places = [(1, 0), (2, 7), (1, 6)]  # the last is nowhere
+    targets = [{"scene_id": s, "im_id": i, "obj_id": 1, "inst_count": 1} for s, i in places]
+    write_json(root / "test_targets_bop19.json", targets)
     reasons = {"corrupt_annotation": 6, "missing_mesh": 1, "missing_model_info": 1}
     return reasons | {"bad_box": 1, "missing_image": 1, "missing_annotation": 2}
 
@@ -214,13 +183,8 @@ def write_web(root):
     write_mesh(root / "no_table" / "mesh.off")
     write_mesh(root / "other_table" / "mesh.off")
     root.joinpath("other_table", "views.csv").write_text("image,x,y\n")
-    return {
-        "missing_image": 1,
-        "bad_box": 2,
-        "corrupt_annotation": 6,
-        "missing_mesh": 1,
-        "missing_annotation": 1,
-    }
+    reasons = {"missing_image": 1, "bad_box": 2, "corrupt_annotation": 6}
+    return reasons | {"missing_mesh": 1, "missing_annotation": 1}
 
 
 def write_json(path, content):

@@ -1,7 +1,5 @@
 """Folders as other tools lay them out, of one photograph and mesh whose pose is known."""
 
-import shutil
-
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,71 +22,61 @@ def write_peers(folder, photo, mesh, T, K):
     picture = cv2.imread(str(photo))
     H, W = picture.shape[:2]
     depth = render_depth(mesh, T[None], K[None], (H, W))[0, 0]
-    rows, columns = (depth > 0).nonzero().unbind(1)
-    x0, y0, x1, y1 = (int(v) for v in (columns.min(), rows.min(), columns.max(), rows.max()))
     mask = (255 * (depth > 0)).byte().numpy()
-    cv2.imwrite(str(folder / "mask.png"), mask)
-    in_mm = mesh.copy()
-    in_mm.apply_scale(1000.0)
-    bbox = [x0, y0, x1 - x0 + 1, y1 - y0 + 1]
-    quaternion = Rotation.from_matrix(T[:3, :3].numpy()).as_quat().tolist()
+    x0, y0, w, h = cv2.boundingRect(mask)
+    bbox = [x0, y0, w, h]
+    in_mm = mesh.copy().apply_scale(1000.0)
+    R = T[:3, :3].numpy()
 
     megapose = folder / "megapose"
-    (megapose / "meshes" / "truck").mkdir(parents=True)
-    in_mm.export(megapose / "meshes" / "truck" / "truck.ply")
-    cv2.imwrite(str(megapose / "image_rgb.png"), picture)
-    write_json(megapose / "camera_data.json", {"K": K.tolist(), "resolution": [H, W]})
-    write_json(
-        megapose / "inputs" / "object_data.json",
-        [{"label": "truck", "bbox_modal": [x0, y0, x1, y1]}],
-    )
-    pose = [quaternion, T[:3, 3].tolist()]
-    write_json(megapose / "outputs" / "object_data.json", [{"label": "truck", "TWO": pose}])
-
     foundation = folder / "foundationpose"
-    for name in ("rgb", "masks", "mesh", "ob_in_cam"):
-        (foundation / name).mkdir(parents=True)
-    mesh.export(foundation / "mesh" / "truck.obj")
-    cv2.imwrite(str(foundation / "rgb" / "000000.png"), picture)
-    cv2.imwrite(str(foundation / "masks" / "000000.png"), mask)
+    bop = folder / "bop"
+    for place in (
+        megapose / "meshes" / "truck" / "truck.ply",
+        foundation / "mesh" / "truck.obj",
+        bop / "models" / "obj_000001.ply",
+    ):
+        place.parent.mkdir(parents=True)
+        (mesh if foundation in place.parents else in_mm).export(place)
+    for place, pixels in (
+        (folder / "mask.png", mask),
+        (megapose / "image_rgb.png", picture),
+        (foundation / "rgb" / "000000.png", picture),
+        (foundation / "masks" / "000000.png", mask),
+        (bop / "test" / "000001" / "rgb" / "000003.png", picture),
+    ):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(place), pixels)
+
+    write_json(megapose / "camera_data.json", {"K": K.tolist(), "resolution": [H, W]})
+    pose = [Rotation.from_matrix(R).as_quat().tolist(), T[:3, 3].tolist()]
+    for part, known in (
+        ("inputs", {"bbox_modal": [x0, y0, x0 + w - 1, y0 + h - 1]}),
+        ("outputs", {"TWO": pose}),
+    ):
+        write_json(megapose / part / "object_data.json", [{"label": "truck", **known}])
+
+    (foundation / "ob_in_cam").mkdir()
     np.savetxt(foundation / "cam_K.txt", K.numpy())
     np.savetxt(foundation / "ob_in_cam" / "000000.txt", T.numpy())
 
-    scene = folder / "bop" / "test" / "000001"
-    (scene / "rgb").mkdir(parents=True)
-    (folder / "bop" / "models").mkdir()
-    shutil.copy(
-        megapose / "meshes" / "truck" / "truck.ply", folder / "bop" / "models" / "obj_000001.ply"
-    )
-    cv2.imwrite(str(scene / "rgb" / "000003.png"), picture)
-    entry = {
-        "cam_R_m2c": T[:3, :3].flatten().tolist(),
-        "cam_t_m2c": (1000 * T[:3, 3]).tolist(),
-        "obj_id": 1,
-    }
-    write_json(scene / "scene_gt.json", {"3": [entry]})
-    write_json(
-        scene / "scene_camera.json", {"3": {"cam_K": K.flatten().tolist(), "depth_scale": 1.0}}
-    )
+    in_mm_pose = {"cam_R_m2c": R.flatten().tolist(), "cam_t_m2c": (1000 * T[:3, 3]).tolist()}
+    camera = {"cam_K": K.flatten().tolist(), "depth_scale": 1.0}
+    for name, content in (("gt", [{**in_mm_pose, "obj_id": 1}]), ("camera", camera)):
+        write_json(bop / "test" / "000001" / f"scene_{name}.json", {"3": content})
     found = {"scene_id": 1, "image_id": 3, "category_id": 1, "bbox": bbox, "score": 0.9}
-    write_json(
-        folder / "bop" / "detections.json",
-        [found, {**found, "category_id": 2, "bbox": [0, 0, 40, 40]}],
-    )
+    other = {**found, "category_id": 2, "bbox": [0, 0, 40, 40]}
+    write_json(bop / "detections.json", [found, other])
 
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    in_opengl = flip @ T.numpy()
+    in_opengl = np.diag([1.0, -1.0, -1.0, 1.0]) @ T.numpy()
     in_opengl[:3, 3] *= 1000
     np.savetxt(folder / "vuforia.txt", in_opengl.T)  # column by column
 
     labels = folder / "runs" / "shots" / "labels"
     labels.mkdir(parents=True)
-    centre = [(x0 + x1 + 1) / 2 / W, (y0 + y1 + 1) / 2 / H, (x1 - x0 + 1) / W, (y1 - y0 + 1) / H]
-    line = " ".join(f"{value:.6f}" for value in [*centre, 0.9])
-    names = ("1", "2")
-    for name in names:
+    box = [(x0 + w / 2) / W, (y0 + h / 2) / H, w / W, h / H]
+    line = " ".join(f"{value:.6f}" for value in [*box, 0.9])
+    found = {"category_id": 1, "bbox": bbox, "score": 0.8}
+    for name in ("1", "2"):
         (labels / f"{name}.txt").write_text(f"0 {line}\n")
-    write_json(
-        folder / "boxes.json",
-        [{"image_id": name, "category_id": 1, "bbox": bbox, "score": 0.8} for name in names],
-    )
+    write_json(folder / "boxes.json", [{"image_id": name, **found} for name in ("1", "2")])

@@ -51,31 +51,34 @@ def test_a_focal_length_that_the_photograph_contradicts_is_named_and_not_reliabl
         return
     assert result.confidence > 0.9
     assert not result.reliable
-    assert [text for text in result.warnings if "shows a focal length of about" in text]
+    assert "shows a focal length of about" in result.warnings[-1]
     shown = float(result.warnings[-1].split("about ")[1].split(" px")[0])
     assert shown == pytest.approx(FOCAL, rel=0.05)
 
 
+def together(*factors):
+    """What was given for each of several cameras, in one."""
+    given = [registered(factor)[1] for factor in factors]
+    describer, crops, _, _ = given[0]
+    poses, printed = zip(*(one[2:] for one in given), strict=True)
+    return describer, crops, Hypotheses.cat(poses), torch.cat(printed)
+
+
 def test_focal_lengths_of_several_photographs_are_compared_at_once(monkeypatch):
-    given = [registered(factor)[1] for factor in (0.7, 1.0, 1.3)]
-    describer, crops = given[0][:2]
-    poses = Hypotheses.cat([one[2] for one in given])
-    printed = torch.cat([one[3] for one in given])
-    gaps, deviations = camera_module.focal_gaps(describer, crops, poses, printed)
-    alone = [float(camera_module.focal_gaps(*one)[0]) for one in given]
+    factors = (0.7, 1.0, 1.3)
+    gaps, deviations = camera_module.focal_gaps(*together(*factors))
+    alone = [float(camera_module.focal_gaps(*registered(factor)[1])[0]) for factor in factors]
     assert gaps.tolist() == pytest.approx(alone, abs=1e-5)
     assert gaps.tolist() == pytest.approx([0.357, 0.0, -0.262], abs=0.04)
     assert deviations[1] == torch.inf, "the first step is small: nobody looked further"
     assert float(deviations[0]) < 0.15
     monkeypatch.setattr(camera_module, "CLEAR_DEVIATION", float(deviations.min()))
-    strict = camera_module.focal_gaps(describer, crops, poses, printed)[1]
+    strict = camera_module.focal_gaps(*together(*factors))[1]
     assert strict.isinf().all(), "as clear as that, none is determined"
 
 
 def test_the_print_of_each_photograph_is_compared_with_its_own_pose(monkeypatch):
-    given = [registered(factor)[1] for factor in (1.0, 0.7, 1.3)]
-    describer, crops = given[0][:2]
-    poses = Hypotheses.cat([one[2] for one in given])
+    describer, crops, poses, _ = together(1.0, 0.7, 1.3)
 
     def missing(_, __, pose, problem):
         assert torch.equal(problem.K[0], (crops.transforms[0] @ pose.cameras[0]))
@@ -143,15 +146,16 @@ def test_prints_are_those_of_photographs_in_which_keypoints_count(monkeypatch, k
 
 
 def test_contradictions_need_a_clear_focal_length_two_deviations_and_a_distance_that_matters():
-    def named(gap, deviation, given=0.0):
-        return focal_contradiction(500.0, gap, deviation, given_deviation=given) is not None
-
-    assert named(0.21, 0.1)
-    assert named(-0.21, 0.1)
-    assert not named(0.19, 0.1)
-    assert not named(0.6, torch.inf), "not determined"
-    assert named(0.2, 0.05)
-    assert not named(0.2, 0.05, 0.1), "the camera is not known better"
-    assert named(-0.15, 0.01)
-    assert not named(-0.13, 0.01), "a distance that is less than 15 % off"
+    for gap, deviation, given, is_named in (
+        (0.21, 0.1, 0.0, True),
+        (-0.21, 0.1, 0.0, True),
+        (0.19, 0.1, 0.0, False),
+        (0.6, torch.inf, 0.0, False),  # not determined
+        (0.2, 0.05, 0.0, True),
+        (0.2, 0.05, 0.1, False),  # the camera is not known better
+        (-0.15, 0.01, 0.0, True),
+        (-0.13, 0.01, 0.0, False),  # a distance that is less than 15 % off
+    ):
+        said = focal_contradiction(500.0, gap, deviation, given_deviation=given)
+        assert (said is not None) == is_named
     assert "1000 px, not the camera's 500 px" in str(focal_contradiction(500.0, 0.69315, 0.01))

@@ -63,25 +63,22 @@ def test_views_exactly_thirty_degrees_apart_are_near_whatever_the_rounding(degre
 
 def test_logistic_model_in_closed_form():
     model = confidence.LogisticModel({"similarity": 3.0, "margin": 0.5}, -2.0)
-    assert model({"similarity": 0.7, "margin": 2.0}) == pytest.approx(
-        1 / (1 + math.exp(-(2.1 + 1.0 - 2.0)))
-    )
-    tied = pytest.approx(1 / (1 + math.exp(-(0.3 - 2.0))))
-    assert model({"similarity": 0.1, "margin": None}) == tied, "as a margin of 0"
-    assert model({"similarity": 0.1, "margin": 0.0}) == tied
-    assert model({"similarity": 5.0, "margin": None}) == confidence.UNCOMPARED_CONFIDENCE, (
-        "bounded without a rival"
-    )
-    assert (confidence.LogisticModel({}, 1e4)({}), confidence.LogisticModel({}, -1e4)({})) == (
-        1.0,
-        0.0,
-    )
+    for similarity, margin, logit in (
+        (0.7, 2.0, 2.1 + 1.0 - 2.0),
+        (0.1, 0.0, 0.3 - 2.0),
+        (0.1, None, 0.3 - 2.0),
+    ):
+        found = model({"similarity": similarity, "margin": margin})
+        assert found == pytest.approx(1 / (1 + math.exp(-logit)))
+    without_rival = model({"similarity": 5.0, "margin": None})
+    assert without_rival == confidence.UNCOMPARED_CONFIDENCE
+    for bias, expected in ((1e4, 1.0), (-1e4, 0.0)):
+        assert confidence.LogisticModel({}, bias)({}) == expected
 
 
 def test_shares_are_equal_within_the_resolution_and_fall_with_the_slope_beyond(monkeypatch):
     monkeypatch.setitem(confidence.CALIBRATION, "instance", {"slope": 2.0, "resolution": 0.5})
     for scores, weights in (
-        ([3.0, 3.0], [1.0, 1.0]),
         ([3.0, 2.6], [1.0, 1.0]),
         ([2.6, 3.0], [1.0, 1.0]),
         ([3.0, 1.5, -1.0], [1.0, math.exp(-2.0), math.exp(-7.0)]),
@@ -106,11 +103,9 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
     assert all(model["weights"][name] >= 0.0 for name in confidence.EVIDENCE_FEATURES)
     assert all(model["weights"][name] <= 0.0 for name in confidence.DOUBT_FEATURES)
     tied = {**FEATURES, "margin": 0.0}
-    decisive = ("similarity", "edge_support") if exact else ("similarity",)
-    for name in decisive:
-        more = confidence.probability_of_any({**tied, name: tied[name] + 0.1}, exact=exact)
-        less = confidence.probability_of_any(tied, exact=exact)
-        assert more > less
+    less = confidence.probability_of_any(tied, exact=exact)
+    for name in ("similarity", "edge_support") if exact else ("similarity",):
+        assert confidence.probability_of_any({**tied, name: tied[name] + 0.1}, exact=exact) > less
 
 
 def test_confidence_features():
@@ -140,10 +135,9 @@ def test_confidence_features():
     for factor in (10.0, -10.0):
         margin = confidence.confidence_features(evidence, factor * scores, 0.3, **given)["margin"]
         assert margin == math.copysign(5.0, factor)
-    no_print = {**given, "printed": 0.0}
-    assert confidence.confidence_features(evidence, scores, 0.3, **no_print)["unmatched"] == 0.0
-    unknown = {**given, "focal": 3.0}
-    assert confidence.confidence_features(evidence, scores, 0.3, **unknown)["focal"] == 1.0
+    other = {**given, "printed": 0.0, "focal": 3.0}
+    found = confidence.confidence_features(evidence, scores, 0.3, **other)
+    assert (found["unmatched"], found["focal"]) == (0.0, 1.0)
     alone = confidence.confidence_features(evidence[:1], scores[:1], None, **given)
     assert alone["margin"] is alone["ranking_share"] is None
 
@@ -153,12 +147,11 @@ def test_undetermined_axes():
     covariance = torch.diag(variances)
     assert confidence.undetermined_axes(covariance) == pytest.approx(0.2 + 0.5 + 1.0)
     assert confidence.undetermined_axes(torch.full_like(covariance, torch.nan)) == 3.0
+    # of bodies of revolution one axis need not be known
     few = torch.eye(4).repeat(35, 1, 1)
     many = torch.eye(4).repeat(36, 1, 1)
     assert confidence.undetermined_axes(covariance, few) == pytest.approx(1.7)
-    assert confidence.undetermined_axes(covariance, many) == pytest.approx(0.7), (
-        "one axis need not be known"
-    )
+    assert confidence.undetermined_axes(covariance, many) == pytest.approx(0.7)
     assert confidence.undetermined_axes(0.01 * covariance, many) == 0.0
 
 
@@ -199,14 +192,11 @@ def test_uncalibrated_pipeline_gives_no_number():
 @pytest.mark.parametrize(("seed", "camera"), [(0, CAMERA), (1, None)])
 def test_confidence_is_that_of_the_reported_features(seed, camera):
     image, box, _ = scene(seed)
-    registrar = (
-        learned_registrar()
-        if camera is not None
-        else exact_registrar(learned_registrar().bank, mesh_is="similar")
-    )
+    exact = camera is not None
+    registrar = exact_registrar(learned_registrar().bank, mesh_is=None if exact else "similar")
     result = registrar([image], box[None], camera)[0]
-    any_right = confidence.probability_of_any(result.confidence_features, exact=camera is not None)
-    weights = vars(registrar.score_weights(exact=camera is not None))
+    any_right = confidence.probability_of_any(result.confidence_features, exact=exact)
+    weights = vars(registrar.score_weights(exact=exact))
     scores = [
         sum(weights[name] * value for name, value in h.evidence.items()) for h in result.hypotheses
     ]
@@ -216,14 +206,12 @@ def test_confidence_is_that_of_the_reported_features(seed, camera):
     far = int(rivals.sum()) + 1
     assert rivals.tolist() == [True] * (far - 1) + [False] * (len(R) - far)
     expected = confidence.hypothesis_probabilities(
-        any_right, torch.tensor(scores[:far]), exact=camera is not None
+        any_right, torch.tensor(scores[:far]), exact=exact
     )
     assert result.probabilities == pytest.approx((*expected, *[0.0] * (len(R) - far)), abs=1e-5)
+    best = result.hypotheses[0].evidence
     assert result.confidence_features["similarity"] == result.score
-    assert (
-        result.confidence_features["edge_support"] == result.hypotheses[0].evidence["edge_support"]
-    )
-    assert len(result.probabilities) == len(result.hypotheses)
+    assert result.confidence_features["edge_support"] == best["edge_support"]
     assert sum(result.probabilities) + result.no_match_probability == pytest.approx(1.0)
 
 

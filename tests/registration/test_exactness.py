@@ -7,7 +7,11 @@ import torch
 
 from curvireg_torch.calibration import CALIBRATION
 from curvireg_torch.fitting.exactness import Exactness, exactness_of
-from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
+from curvireg_torch.geometry import (
+    rotation_error,
+    rotation_from_axis_angle,
+    rotation_from_viewpoint,
+)
 from curvireg_torch.geometry.cameras import rotation_towards
 from curvireg_torch.registration.camera import principal_covariance
 from curvireg_torch.registration.hypotheses import placed
@@ -28,6 +32,10 @@ def pose():
     return R, t, rotation_towards(position[None])[0].T @ R, float(position.norm())
 
 
+def check_fraction(are_within):
+    assert are_within.double().mean() == pytest.approx(0.9, abs=0.02)
+
+
 def test_nine_in_ten_errors_are_within(monkeypatch):
     monkeypatch.setitem(CALIBRATION, "radius", {"rotation": 1.0, "distance": 1.0})
     R, t, allocentric, distance = pose()
@@ -37,15 +45,11 @@ def test_nine_in_ten_errors_are_within(monkeypatch):
     errors = normal * COVARIANCE.diagonal().sqrt()
     turns = rotation_from_axis_angle(errors[:, :3])
     centres = turns @ R @ CENTRE + t + errors[:, 3:]
-    within = torch.rad2deg(errors[:, :3].norm(dim=1)) < exactness.rotation_deg
-    assert within.double().mean() == pytest.approx(0.9, abs=0.02)
+    check_fraction(torch.rad2deg(errors[:, :3].norm(dim=1)) < exactness.rotation_deg)
     away = 100.0 * (centres.norm(dim=1) / distance - 1.0).abs()
-    within = away < exactness.distance_percent
-    assert within.double().mean() == pytest.approx(0.9, abs=0.02)
+    check_fraction(away < exactness.distance_percent)
     seen = rotation_towards(centres).mT @ turns @ R
-    cosine = ((seen * allocentric).sum(dim=(1, 2)) - 1.0) / 2.0
-    within = torch.rad2deg(cosine.clamp(-1.0, 1.0).acos()) < exactness.allocentric_deg
-    assert within.double().mean() == pytest.approx(0.9, abs=0.02)
+    check_fraction(rotation_error(seen, allocentric) < exactness.allocentric_deg)
 
 
 def test_a_principal_point_that_is_not_known_leaves_the_allocentric_rotation_exact():
@@ -71,9 +75,12 @@ def test_a_turn_that_nothing_determines_is_left_out():
 
 
 def test_words_have_one_digit():
-    assert Exactness(2.6, 1.9, 1.0).words == "to about 3 degrees and 2 % of the distance"
-    assert Exactness(1.2, 0.34, 1.0).words == "to about 1 degree and 0.3 % of the distance"
-    assert Exactness(14.0, 0.01, 1.0).words == "to about 10 degrees and 0.1 % of the distance"
+    for degrees, percent, words in (
+        (2.6, 1.9, "3 degrees and 2 %"),
+        (1.2, 0.34, "1 degree and 0.3 %"),
+        (14.0, 0.01, "10 degrees and 0.1 %"),
+    ):
+        assert Exactness(degrees, percent, 1.0).words == f"to about {words} of the distance"
 
 
 def test_results_say_how_exact_they_are_and_what_the_distance_holds_for():

@@ -10,7 +10,7 @@ from curvireg_torch import camera_matrix
 from curvireg_torch.fitting import focal_length
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.geometry import Camera, axis_angle_from_rotation
-from curvireg_torch.geometry.cameras import point_in_cameras, rotation_towards
+from curvireg_torch.geometry.cameras import point_in_cameras, project_points, rotation_towards
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.hypotheses import projected_box
 from curvireg_torch.registration.photograph import as_photograph
@@ -38,10 +38,9 @@ def test_covariance_and_deviation_of_the_focal_length():
     item = as_photograph(image, box, Camera(NEAR, focal_deviation=0.05, source="exif"))
     covariance, deviation = camera_module.focal_covariance(describer, crops, poses, item)
     assert 0.0 < deviation < 0.05, "the prior and the photograph together"
-    z = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
-    assert float(covariance[0, 5, 5].sqrt()) == pytest.approx(deviation * z, rel=0.5), (
-        "the distance grows with it"
-    )
+    # the distance grows with it
+    z = float(point_in_cameras(T[None], describer.centre)[0, 2])
+    assert float(covariance[0, 5, 5].sqrt()) == pytest.approx(deviation * z, rel=0.5)
     assert int(torch.linalg.matrix_rank(covariance[0])) == 1
 
 
@@ -53,10 +52,9 @@ def test_an_unknown_camera_is_estimated():
     ratio = float(result.camera.matrix[0, 0] / NEAR[0, 0])
     assert abs(ratio - 1.0) < max(0.1, 3.0 * result.camera.focal_deviation)
     assert degrees_off(result, T) < 5.0
+    # the distance is proportional to the focal length
     position = result.transform[:3, 3] / ratio - T[:3, 3]
-    assert position.norm() < 0.1 * float(T[:3, 3].norm()), (
-        "the distance is proportional to the focal length"
-    )
+    assert position.norm() < 0.1 * float(T[:3, 3].norm())
     given = learned_registrar()([image], box[None], NEAR)[0]
     assert (given.camera.source, given.camera.focal_deviation) == ("given", 0.0)
     assert result.standard_deviations[1][2] > given.standard_deviations[1][2]
@@ -73,8 +71,8 @@ def test_focal_lengths_with_small_deviations_are_right():
     ratios = []
     for seed in range(6):
         generator = seeded(seed)
-        widths = (0.7, 1.0, 1.4)[seed % 3]
-        K = camera_matrix(640 * widths, 640 * widths, 319.5, 239.5, dtype=torch.float64)
+        focal = 640 * (0.7, 1.0, 1.4)[seed % 3]
+        K = camera_matrix(focal, focal, 319.5, 239.5, dtype=torch.float64)
         T = random_pose(mesh, K, size, generator, elevations=(5.0, 50.0))
         near = double([0.0, 0.0, 2.5 * describer.radius])
         T[:3, 3] = near - T[:3, :3] @ describer.centre
@@ -97,14 +95,11 @@ def test_zoomed_poses_keep_their_images():
     moved = camera_module.zoomed(poses, torch.tensor([2.0 * float(NEAR[0, 0])]), describer.centre)
     assert float(moved.cameras[0, 0, 0]) == pytest.approx(2.0 * float(NEAR[0, 0]))
     assert float(moved.distance[0]) > 1.9 * float(poses.distance[0])
-    before = projected_box(describer, (T, NEAR))
-    after = projected_box(describer, (moved.T[0], moved.cameras[0]))
+    pairs = (T, NEAR), (moved.T[0], moved.cameras[0])
+    before, after = (projected_box(describer, pair) for pair in pairs)
     assert (before - after).abs().max() < 0.2 * float((before[2:] - before[:2]).max())
-    centre = [
-        (K @ (P[:3, :3] @ describer.centre + P[:3, 3]))
-        for P, K in ((T, NEAR), (moved.T[0], moved.cameras[0]))
-    ]
-    assert torch.allclose(centre[0][:2] / centre[0][2], centre[1][:2] / centre[1][2])
+    before, after = (project_points(describer.centre[None], *pair) for pair in pairs)
+    assert torch.allclose(before, after)
 
 
 def test_priors_by_source():
@@ -112,30 +107,27 @@ def test_priors_by_source():
     item = as_photograph(image, box, NEAR)
     cameras = focal_length.scaled_cameras(NEAR[None], double([0.1]))
     exif = camera_module.focal_prior(item.by(NEAR, focal_deviation=0.05, source="exif"), cameras)
-    assert float(exif.log_zoom) == pytest.approx(-0.1)
-    assert (float(exif.low), float(exif.high)) == (pytest.approx(-0.3), pytest.approx(0.1))
+    found = [float(zoom) for zoom in (exif.low, exif.log_zoom, exif.high)]
+    assert found == pytest.approx([-0.3, -0.1, 0.1])
     assert (exif.deviation, exif.reach) == (0.05, float("inf"))
     usual = camera_module.focal_prior(item.by(NEAR, source="estimated"), NEAR[None])
-    assert float(usual.log_zoom.exp()) == pytest.approx(
-        focal_length.USUAL_FOCAL * max(SIZE) / 150.0
-    )
-    limits = [150.0 / max(SIZE) * float(limit.exp()) for limit in (usual.low, usual.high)]
-    assert limits == pytest.approx(list(focal_length.FOCAL_LIMITS))
+    least, most = focal_length.FOCAL_LIMITS
+    zooms = (usual.low, usual.log_zoom, usual.high)
+    found = [150.0 / max(SIZE) * float(zoom.exp()) for zoom in zooms]
+    assert found == pytest.approx([least, focal_length.USUAL_FOCAL, most])
 
 
 def test_an_unknown_principal_point_moves_the_object_with_its_ray_and_keeps_its_look():
-    size = (180, 240)
     centre = double([0.3, -0.2, 0.4])
     T = scene(0)[2][None].double()
-    pose = placed_at(T, centre)
-    covariance = camera_module.principal_covariance(pose, size, centre)[0]
+    position = point_in_cameras(T, centre)
+    covariance = camera_module.principal_covariance(placed_at(T, centre), SIZE, centre)[0]
     pixels = camera_module.PRINCIPAL_DEVIATION * 240
     moved_by = torch.zeros(6, 6, dtype=torch.float64)
     for axis in range(2):
         step = 1e-4
         camera = CAMERA.clone()
         camera[axis, 2] -= step * pixels
-        position = point_in_cameras(T, centre)
         ray = torch.linalg.inv(camera) @ (CAMERA @ position[0] / position[0, 2])
         after = (ray * position[0, 2])[None]
         R = rotation_towards(after) @ rotation_towards(position).mT @ T[:, :3, :3]

@@ -1,6 +1,6 @@
 """Several meshes that may be the object: rivals, of which none is believed where two fit."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from unittest.mock import Mock
 
@@ -8,12 +8,13 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import Registrar, sample_views
+from curvireg_torch import Registrar
 from curvireg_torch.errors import LostObjectError
+from curvireg_torch.evidence import Evidence
 from curvireg_torch.fitting.details import ContourDetails
 from curvireg_torch.registration import FailedRegistration, judging, stages
 from curvireg_torch.registration.judging import best_of_meshes, joined
-from tests._support import CAMERA, answer_of, bank_of, learned_registrar, slow_after
+from tests._support import CAMERA, answer_of, bank_around, learned_registrar, slow_after
 from tests._support.results import registration
 from tests.registration.test_ties import photograph
 
@@ -31,9 +32,7 @@ def truck(*, with_cabin=True):
 
 @cache
 def bank(*, with_cabin=True, scale=1.0):
-    mesh = truck(with_cabin=with_cabin).copy().apply_scale(scale)
-    views = sample_views(azimuth_step=30, elevations=[10, 30, 50])
-    return bank_of(mesh, views, image_size=96)
+    return bank_around(truck(with_cabin=with_cabin).copy().apply_scale(scale), 30, [10, 30, 50])
 
 
 def registered(shown, *banks):
@@ -65,8 +64,7 @@ def test_a_variant_with_a_part_more_is_told_from_that_without(with_cabin, order)
 
 def result_of(similarity, confidence, rival=0.1):
     made = registration(confidence=confidence)
-    names = "rank", "similarity", "edge_support", "appearance", "keypoints", "details", "contours"
-    nothing = dict.fromkeys(names, 0.0)
+    nothing = dict.fromkeys((field.name for field in fields(Evidence)), 0.0)
     hypotheses = tuple(
         replace(hypothesis, evidence={**nothing, "similarity": value})
         for hypothesis, value in zip(made.hypotheses, (similarity, rival), strict=True)
@@ -79,10 +77,9 @@ def best(*results):
 
 
 def test_the_mesh_with_the_higher_score_is_the_answer_and_keeps_its_confidence():
-    low = result_of(0.2, 0.4)
-    high = result_of(0.8, 0.9)
-    for results, index in (((low, high), 1), ((high, low), 0)):
-        found = best(*results)
+    results = [result_of(0.2, 0.4), result_of(0.8, 0.9)]
+    for order, index in ((1, 1), (-1, 0)):
+        found = best(*results[::order])
         assert found.mesh_index == index
         assert found.confidence == pytest.approx(0.9, abs=0.01)
         assert found.ambiguous is None
@@ -126,11 +123,8 @@ def test_meshes_that_fail_are_left_out():
 
 def test_without_probabilities_the_higher_score_decides():
     one = replace(result_of(0.8, 0.9), probabilities=())
-    other = result_of(0.5, 0.9)
-    other = replace(
-        other, probabilities=(), hypotheses=tuple(replace(h, score=0.9) for h in other.hypotheses)
-    )
-    assert best(one, other).mesh_index == 1
+    better = tuple(replace(h, score=0.9) for h in one.hypotheses)
+    assert best(one, replace(one, hypotheses=better)).mesh_index == 1
     assert best(one, one).mesh_index == 0
 
 
@@ -144,24 +138,27 @@ def test_details_of_meshes_with_fewer_points_are_filled_with_invalid_ones():
     assert both.valid.sum(dim=1).tolist() == [3, 5]
 
 
+@cache
+def found_in_box():
+    return registered(truck(), bank())
+
+
 @pytest.mark.parametrize("best", [0, 1])
 def test_boxes_are_corrected_for_the_best_mesh_alone(monkeypatch, best):
     registrar = Registrar([bank(), bank()])
     image, box, _ = photograph(truck(), 35.0, 25.0, 0)
     rough = box - torch.tensor([0.1, 0.0, 0.0, 0.0]) * (box[2] - box[0])
-    (one,) = Registrar(bank())([image], box[None], CAMERA)
+    one = found_in_box()
     first = one.hypotheses[0]
-    registered = []
+    asked = []
 
     def register_boxes(target, items):
         is_best = (target is registrar) == (best == 0)
-        registered.extend(is_best for _ in items)
+        asked.extend(is_best for _ in items)
         evidence = first.evidence | {"similarity": 0.9 if is_best else 0.1}
-        doubtful = replace(
-            one, hypotheses=(replace(first, evidence=evidence),), probabilities=(0.4,)
-        )
-        return [doubtful for _ in items]
+        hypotheses = (replace(first, evidence=evidence),)
+        return [replace(one, hypotheses=hypotheses, probabilities=(0.4,)) for _ in items]
 
     monkeypatch.setattr(stages, "register_boxes", register_boxes)
     assert registrar([image], rough[None], CAMERA)[0].mesh_index == best
-    assert registered == [best == 0, best == 1, True]
+    assert asked == [best == 0, best == 1, True]
