@@ -133,8 +133,8 @@ def write_bop(root):
     three = [pose, {**pose, "obj_id": 2}, {**pose, "cam_t_m2c": [9.0, 2.0, 400.0]}]
     ground_truth = {"0": three, "3": bad, **{key: [pose] for key in "45x"}}
     outside = {**info, "bbox_obj": [-1, -1, -1, -1]}
-    infos = {"0": [info, hidden, {**info, "visib_fract": 0.9}], "4": [info]}
-    infos["3"] = [info] * 5 + [outside, info]
+    infos = {"0": [info, hidden, {**info, "visib_fract": 0.9}]}
+    infos |= {"3": [info] * 5 + [outside, info], "4": [info]}
     cameras = dict.fromkeys(("0", "3", "4"), K)  # 5: without camera
     for name, content in (("gt", ground_truth), ("camera", cameras), ("gt_info", infos)):
         write_json(one / f"scene_{name}.json", content)

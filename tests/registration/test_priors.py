@@ -15,6 +15,7 @@ from curvireg_torch.geometry import (
     rotation_towards,
     viewpoint_from_rotation,
 )
+from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.geometry.pose_prior import PosePrior
 from curvireg_torch.registration.block import Limits
 from curvireg_torch.registration.hypotheses import Hypotheses
@@ -85,12 +86,15 @@ def pose_at(away=1.5, degrees=0.0):
 
 def test_fitted_poses_up_to_three_degrees_outside_are_kept_and_within_a_degree_of_a_limit_lie_at_it():  # noqa: E501
     limits = limits_of(PosePrior(rotation=eye(3), within=10.0))
-    assert [bool(limits.keeps(pose_at(degrees=d))) for d in (12.9, 13.1)] == [True, False]
-    words = [
-        limits.contradiction(pose_at(degrees=d), pose_at(), better_outside=False)
-        for d in (8.9, 9.1, 11.0)
-    ]
-    assert words == [None, "at the limit", "at the limit"]
+    for degrees, is_kept, words in (
+        (8.9, True, None),
+        (9.1, True, "at the limit"),
+        (12.9, True, "at the limit"),
+        (13.1, False, "at the limit"),
+    ):
+        pose = pose_at(degrees=degrees)
+        assert bool(limits.keeps(pose)) == is_kept
+        assert limits.contradiction(pose, pose_at(), better_outside=False) == words
 
 
 # Limits of which one moves a rotation out of another
@@ -102,20 +106,14 @@ def test_poses_are_turned_into_all_limits_about_their_centre():
     describer = truck_registrar().describer
     rotation = truck_bank().rotations.double()[::7]
     view = torch.arange(len(rotation))
-    box = torch.tensor([200.0, 20.0, 238.0, 60.0])
-    poses = Hypotheses.in_boxes(
-        describer,
-        box.expand(len(view), 4),
-        CAMERA.expand(len(view), 3, 3),
-        rotation,
-        torch.ones(len(view)),
-        view,
-        0.0 * view,
-    )
+    boxes = torch.tensor([200.0, 20.0, 238.0, 60.0]).expand(len(view), 4)
+    cameras = CAMERA.expand(len(view), 3, 3)
+    distance = torch.ones(len(view))
+    poses = Hypotheses.in_boxes(describer, boxes, cameras, rotation, distance, view, 0.0 * view)
     moved = limits.moved_inside(poses)
     assert COMBINED.excess(moved.T[:, :3, :3]).max() < 0.01
     assert limits.moved_inside(moved).T.equal(moved.T)
-    before, after = (P[:, :3, :3] @ describer.centre + P[:, :3, 3] for P in (poses.T, moved.T))
+    before, after = (point_in_cameras(T, describer.centre) for T in (poses.T, moved.T))
     assert_close(before, after)
 
 
@@ -157,10 +155,7 @@ def test_every_hypothesis_lies_at_an_allowed_distance(pipeline, factors):
     near, far = (factor * DISTANCE for factor in factors)
     result = registrar(*ONE, prior=PosePrior(distance=(near, far)))[0]
     for hypothesis in result.hypotheses:
-        distance = float(
-            (hypothesis.rotation @ registrar.describer.centre + hypothesis.translation).norm()
-        )
-        assert 0.97 * near <= distance <= 1.03 * far
+        assert 0.97 * near <= hypothesis.distance <= 1.03 * far
     assert result.prior_contradiction == "better outside"
     assert not result.reliable
 
@@ -169,10 +164,10 @@ def test_limits_on_the_distance_keep_contradict_and_move_poses():
     """Fitted poses up to 3 % too far are kept, and others move along their ray; a box may ask for
     10 % more."""
     limits = limits_of(PosePrior(distance=(1.0, 2.0)))
-    kept = [bool(limits.keeps(pose_at(away))) for away in (0.969, 0.972, 2.055, 2.065)]
-    assert kept == [False, True, True, False]
-    asked = [pose_at(away) for away in (0.89, 0.92, 2.19, 2.21)]
-    words = [limits.contradiction(pose_at(1.5), pose, better_outside=False) for pose in asked]
-    assert words == ["better outside", None, None, "better outside"]
+    for away, is_kept in ((0.969, False), (0.972, True), (2.055, True), (2.065, False)):
+        assert bool(limits.keeps(pose_at(away))) == is_kept
+    for away, is_right in ((0.89, False), (0.92, True), (2.19, True), (2.21, False)):
+        words = limits.contradiction(pose_at(1.5), pose_at(away), better_outside=False)
+        assert words == (None if is_right else "better outside")
     for away, expected in ((0.5, 1.0), (1.5, 1.5), (9.0, 2.0)):
         assert_close(limits.moved_inside(pose_at(away)).T, pose_at(expected).T)
