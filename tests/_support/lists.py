@@ -2,23 +2,22 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
 from tests._support.miniature import write_json
-from tests._support.scenes import learned_registrar, scene, truck_bank, write_photo
+from tests._support.numbers import double
+from tests._support.scenes import errors, learned_registrar, scene, truck_bank, write_photo
 from tests.registration.test_several import EASY, rig_of
 
 CAMERA = ["260", "260", "119.5", "89.5"]
-RESULTS = [
-    *("verdict", "message", "confidence", "reliable"),
-    *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
-]
+RESULTS = ["verdict", "message", "confidence", "reliable"]
+RESULTS += [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 RESULTS += ["tx", "ty", "tz", "exactness"]
 
 
@@ -57,10 +56,8 @@ def bop_poses(path):
     for row in rows:
         row |= {name: int(row[name]) for name in ("scene_id", "im_id", "obj_id")}
         row |= {name: float(row[name]) for name in ("score", "time")}
-        row |= {
-            "R": np.array(row["R"].split(), float).reshape(3, 3),
-            "t": np.array(row["t"].split(), float),
-        }
+        row["R"] = np.array(row["R"].split(), float).reshape(3, 3)
+        row["t"] = np.array(row["t"].split(), float)
     return rows
 
 
@@ -69,22 +66,17 @@ def check_pose(document, T, degrees, share):
     translation, as a share of the distance."""
     if "r11" in document:
         R = [[float(document[f"r{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)]
-        document = {
-            "rotation": R,
-            "translation": [float(document[name]) for name in ("tx", "ty", "tz")],
-        }
-    R, t = (
-        torch.tensor(document[name], dtype=torch.float64) for name in ("rotation", "translation")
-    )
-    assert rotation_error(R, T[:3, :3]) < degrees
-    assert ((t - T[:3, 3]).norm() / T[:3, 3].norm()) < share
+        t = [float(document[name]) for name in ("tx", "ty", "tz")]
+        document = {"rotation": R, "translation": t}
+    pose = {name: double(document[name]) for name in ("rotation", "translation")}
+    turned, moved = errors(SimpleNamespace(**pose), T)
+    assert turned < degrees
+    assert moved < share
 
 
 def lines(folder):
-    return [
-        json.loads(line)
-        for line in (folder / "results.jsonl").read_text(encoding="utf-8").splitlines()
-    ]
+    text = (folder / "results.jsonl").read_text(encoding="utf-8")
+    return [json.loads(line) for line in text.splitlines()]
 
 
 def write_rig_photos(folder):

@@ -20,7 +20,7 @@ from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photo
 from tests._support.numbers import double, seeded
 
 SIZE = (180, 240)
-CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
+CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5)
 
 
 @cache

@@ -15,6 +15,7 @@ from curvireg_torch.evaluation import metrics
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from tests._support import double, eye, refused, seeded, uniform
 from tests._support.poses import poses, rotations
+from tests._support.spies import spied
 
 K = double([[600.0, 0.0, 320.0], [0.0, 620.0, 240.0], [0.0, 0.0, 1.0]])
 POINTS = uniform(40, 3) - 0.5
@@ -35,31 +36,33 @@ def _project(xyz, camera):
 
 
 def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict():
-    errors = torch.tensor([0.0, 9.999, 10.0, 29.0, 30.0, torch.inf])
-    assert metrics.average_recall(errors, (10.0,)) == pytest.approx(2 / 6)
-    assert metrics.average_recall(errors, (30.0,)) == pytest.approx(4 / 6)
+    degrees = torch.tensor([0.0, 9.999, 10.0, 29.0, 30.0, torch.inf])
+    # Thresholds 0.05, 0.10, ..., 0.50: the errors pass 10, 9, 5, 0 (0.5 is not below 0.5) and 0 of
+    # the ten.
+    fractions = torch.tensor([0.0, 0.07, 0.26, 0.50, torch.inf])
+    pixels = double([0.0, 7.0, 26.0, 50.0, torch.inf])
+    for errors, thresholds, expected in (
+        (degrees, (10.0,), 2 / 6),
+        (degrees, (30.0,), 4 / 6),
+        (fractions, metrics.MSSD_THRESHOLDS, 24 / 50),
+        (fractions, metrics.ADD_THRESHOLDS, 2 / 5),
+        (pixels / 640, metrics.MSPD_THRESHOLDS, 24 / 50),
+        (pixels / 320, metrics.MSPD_THRESHOLDS, (10 + 8) / 50),
+    ):
+        assert metrics.average_recall(errors, thresholds) == pytest.approx(expected)
     for values, median in (([1.0, 2.0, torch.inf], 2.0), ([1.0, torch.inf, torch.inf], math.inf)):
         assert metrics.median_error(torch.tensor(values)) == median
     for n in (1, 6, 7):
         values = 180.0 * torch.rand(n, generator=seeded(n))
         assert metrics.median_error(values) == pytest.approx(float(np.median(values.numpy())))
-    errors = torch.tensor([0.0, 0.07, 0.26, 0.50, torch.inf])
-    # Thresholds 0.05, 0.10, ..., 0.50: the errors pass 10, 9, 5, 0 (0.5 is not below 0.5) and 0 of
-    # the ten.
-    assert metrics.average_recall(errors, metrics.MSSD_THRESHOLDS) == pytest.approx(24 / 50)
-    assert metrics.average_recall(errors, metrics.ADD_THRESHOLDS) == pytest.approx(2 / 5)
-    pixels = double([0.0, 7.0, 26.0, 50.0, torch.inf])
-    assert metrics.average_recall(pixels / 640, metrics.MSPD_THRESHOLDS) == pytest.approx(24 / 50)
-    assert metrics.average_recall(pixels / 320, metrics.MSPD_THRESHOLDS) == pytest.approx(
-        (10 + 8) / 50
-    )
-    assert math.isnan(metrics.median_error(errors[:0]))
-    assert math.isnan(metrics.average_recall(errors[:0], metrics.MSSD_THRESHOLDS))
-    for bad in ([-1.0], [math.nan], [[0.0, 0.0]], [1]):
-        with refused("errors: expected"):
-            metrics.median_error(torch.tensor(bad))
-        with refused("errors: expected"):
-            metrics.average_recall(torch.tensor(bad), metrics.ADD_THRESHOLDS)
+    for score in (
+        metrics.median_error,
+        lambda errors: metrics.average_recall(errors, metrics.ADD_THRESHOLDS),
+    ):
+        assert math.isnan(score(degrees[:0]))
+        for bad in ([-1.0], [math.nan], [[0.0, 0.0]], [1]):
+            with refused("errors: expected"):
+                score(torch.tensor(bad))
 
 
 def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity():
@@ -132,14 +135,10 @@ def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(monk
     angles = torch.arange(315).double() * (2.0 * math.pi / 315)
     symmetries[:, :3, :3] = rotation_from_axis_angle(angles[:, None] * double([0.0, 0.0, 1.0]))
     points = uniform(6000, 3) - 0.5
-    moved = []
-    transform = metrics._transform
-    monkeypatch.setattr(
-        metrics, "_transform", lambda T, x: moved.append(len(T) * len(x)) or transform(T, x)
-    )
+    moved = spied(monkeypatch, metrics, "_transform")
     metrics.mssd_error(EST, GT, points, symmetries=symmetries)
     metrics.mspd_error(EST, GT, points, K, symmetries=symmetries)
-    assert sum(moved) < 0.25 * 3 * len(EST) * 315 * len(points)
+    assert sum(len(T) * len(x) for T, x in moved) < 0.25 * 3 * len(EST) * 315 * len(points)
 
 
 def test_mspd_error_is_infinite_for_points_behind_the_camera():
@@ -217,6 +216,5 @@ def test_the_largest_distance_of_one_pose_is_that_of_all_points():
         pose[0, 2, 3] = 2.0
     assert float(metrics.mssd_error(quarter, identity, points)) == pytest.approx(math.sqrt(2))
     camera = torch.diag(double([100.0, 100.0, 1.0]))
-    assert float(metrics.mspd_error(quarter, identity, points, camera)) == pytest.approx(
-        50 * math.sqrt(2)
-    )
+    mspd = float(metrics.mspd_error(quarter, identity, points, camera))
+    assert mspd == pytest.approx(50 * math.sqrt(2))

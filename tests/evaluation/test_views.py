@@ -67,11 +67,18 @@ def flat(matrix):
     return matrix.flatten().tolist()
 
 
+def drawn_by(benchmark):
+    """The photographs that are registered with each."""
+    return [[view.photo for view in entry.views] for entry in benchmark.entries]
+
+
 def test_each_photograph_is_the_first_once_and_relative_poses_are_right(trucks):
     benchmark = BOPBenchmark(trucks, Protocol(pose="any", views=3))
-    truths = {entry.photo: transform(s["rotation"].double(), s["translation"].double())
-              for entry, s in zip(benchmark.entries, benchmark.samples, strict=True)}  # fmt: skip
-    assert len({entry.photo for entry in benchmark.entries}) == 8
+    truths = {
+        entry.photo: transform(s["rotation"].double(), s["translation"].double())
+        for entry, s in zip(benchmark.entries, benchmark.samples, strict=True)
+    }
+    assert len(truths) == 8
     for entry in benchmark.entries:
         photos = {view.photo for view in entry.views}
         assert len(photos | {entry.photo}) == 3
@@ -80,17 +87,14 @@ def test_each_photograph_is_the_first_once_and_relative_poses_are_right(trucks):
             relative = view.T_cam_from_world
             expected = truths[view.photo] @ torch.linalg.inv(truths[entry.photo])
             assert_close(relative, expected, atol=1e-3, rtol=0)
-    drawn = [[view.photo for view in entry.views] for entry in benchmark.entries]
-    again = BOPBenchmark(trucks, Protocol(pose="any", views=3))
-    assert drawn == [[view.photo for view in entry.views] for entry in again.entries]
-    other = BOPBenchmark(trucks, Protocol(pose="any", views=3, seed=1))
-    assert drawn != [[view.photo for view in entry.views] for entry in other.entries]
-    with pytest.warns(
-        CurviregWarning, match="views=9: 8 of 8 objects are seen in fewer photographs"
-    ):
+    drawn = drawn_by(benchmark)
+    assert drawn == drawn_by(BOPBenchmark(trucks, Protocol(pose="any", views=3)))
+    assert drawn != drawn_by(BOPBenchmark(trucks, Protocol(pose="any", views=3, seed=1)))
+    fewer = "views=9: 8 of 8 objects are seen in fewer photographs"
+    with pytest.warns(CurviregWarning, match=fewer):
         many = BOPBenchmark(trucks, Protocol(pose="any", views=9))
-    assert {len(entry.views) for entry in many.entries} == {3}
-    assert not any(entry.views for entry in BOPBenchmark(trucks, Protocol(pose="any")).entries)
+    assert {len(photos) for photos in drawn_by(many)} == {3}
+    assert not any(drawn_by(BOPBenchmark(trucks, Protocol(pose="any"))))
 
 
 def test_poses_of_the_cameras_come_first(trucks):
@@ -145,12 +149,8 @@ def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
         assert_allclose(row["photographs"][0]["rotation"], row["rotation"])
         assert_allclose(row["photographs"][0]["translation"], row["translation"])
         failures.update(view["failure"] is not None for view in row["photographs"])
-    drawn = sum(
-        view.photo == broken
-        for entry in benchmark.entries
-        for view in entry.views
-        if entry.photo != broken
-    )
+    others = [entry for entry in benchmark.entries if entry.photo != broken]
+    drawn = sum(view.photo == broken for entry in others for view in entry.views)
     assert failures[True] >= drawn > 0, "a photograph that cannot be read does not spoil the others"
     assert summary["acc_30_deg"] > 0.5
     assert not run(benchmark, tmp_path / "out")["failed"]

@@ -12,7 +12,7 @@ from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from tests._support import double, seeded
 
-K = camera_matrix(300.0, 310.0, 63.5, 60.0, dtype=torch.float64)
+K = camera_matrix(300.0, 310.0, 63.5, 60.0)
 BOX = torch.tensor([40.0, 36, 88, 84])
 
 

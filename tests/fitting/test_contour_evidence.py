@@ -5,7 +5,7 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch.fitting.edges import CROP_SIZE, EdgeCrops
+from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.measured_fit import contour_evidence, contour_support
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.rendering.contours import MeshContours
@@ -79,23 +79,16 @@ def test_few_points_within_count_by_their_number():
 
 
 def test_a_pose_beside_the_object_has_about_none():
-    beside = FRONT.clone()
-    beside[0, 3] += 0.25
-    beside[1, 3] -= 0.25
-    evidence, _ = measured(plate(), photograph(), FRONT, beside)
-    assert abs(float(evidence[1])) < 0.15 * float(evidence[0])
+    beside = transform(eye(3), double([0.25, -0.25, 40.0]))
     turned = FRONT.clone()
     turned[:3, :3] = rotation_from_viewpoint(40.0, 50.0, 30.0).double()
-    evidence, _ = measured(plate(), photograph(), turned)
-    assert abs(float(evidence)) < 0.15
+    evidence, _ = measured(plate(), photograph(), FRONT, beside, turned)
+    assert abs(float(evidence[1])) < 0.15 * float(evidence[0])
+    assert abs(float(evidence[2])) < 0.15
 
 
 def test_points_outside_the_photograph_do_not_count():
     """A plate of which the right half is outside: what is seen has the same evidence."""
     whole, _ = measured(plate(), photograph())
-    image = photograph()[:, :, :110]
-    crops = EdgeCrops.cut([image], BOX, 0.1)
-    index = torch.zeros(1, dtype=torch.long)
-    seen = contour_evidence(MeshContours(plate()), crops, K[None], FRONT[None], index)
+    seen, _ = measured(plate(), photograph()[:, :, :110])
     assert float(seen) == pytest.approx(float(whole), rel=0.1)
-    assert CROP_SIZE > 110

@@ -224,7 +224,7 @@ def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
     mesh = example_mesh()
     generator = seeded(seed)
     size = (360, 480)
-    camera = camera_matrix(600.0, 600.0, 239.5, 179.5, dtype=torch.float64)
+    camera = camera_matrix(600.0, 600.0, 239.5, 179.5)
     truth = random_pose(mesh, camera, size, generator, elevations=(10.0, 50.0))
     # darker than any shade of the object: its outline shows all around
     black = torch.zeros(3, *size)
@@ -303,7 +303,7 @@ def several():
     photographs = []
     starts = []
     for i, size in enumerate([(100, 128), (128, 96), (120, 120)]):
-        camera = camera_matrix(300.0 + 20 * i, 300.0, size[1] / 2, size[0] / 2, dtype=torch.float64)
+        camera = camera_matrix(300.0 + 20 * i, 300.0, size[1] / 2, size[0] / 2)
         truth = random_pose(cube(), camera, size, generator)
         image, box = synthesize_photograph(cube(), truth, camera, size, generator)
         photographs.append(((255 * image).round().byte(), box, camera))

@@ -23,10 +23,9 @@ NEAR = camera_matrix(150.0, 150.0, 119.5, 89.5)  # a wide angle, from where pers
 def near_scene():
     """image, box and true pose of the object of scene 0, at a distance of three radii."""
     T = scene(0)[2].clone()
-    centre = truck_registrar().describer.centre
-    T[:3, 3] += torch.tensor([0.0, 0.0, 3.0 * truck_registrar().describer.radius]) - (
-        T[:3, :3] @ centre + T[:3, 3]
-    )
+    describer = truck_registrar().describer
+    ahead = double([0.0, 0.0, 3.0 * describer.radius])
+    T[:3, 3] = ahead - T[:3, :3] @ describer.centre
     image, box = synthesize_photograph(example_mesh(), T, NEAR, SIZE, seeded(5))
     return image, box, T
 
@@ -36,12 +35,17 @@ def near_problem(wrong=1.0):
     image, box, T = near_scene()
     K = focal_length.scaled_cameras(NEAR[None], double([wrong]).log())
     crops = EdgeCrops.cut([image], box[None], 0.1)
-    index = torch.zeros(1, dtype=torch.long)
-    return ContourProblem.of(truck_registrar().describer.contours, crops, K, index), T[None]
+    return ContourProblem.of(truck_registrar().describer.contours, crops, K), T[None]
 
 
-def fit(problem, T, prior):
-    return focal_length.fit_focal_length(problem, T, prior, FULL_SIZE_RADII)
+def fit(problem, T, prior, matches=None):
+    return focal_length.fit_focal_length(problem, T, prior, FULL_SIZE_RADII, matches)
+
+
+def prior_within(limit, deviation):
+    """Around the focal length of the start."""
+    none = double([0.0])
+    return focal_length.FocalPrior(none, deviation, none - limit, none + limit)
 
 
 def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
@@ -51,19 +55,15 @@ def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
     zoom = double([0.01])
     moved = focal_length.moved_away(T, zoom, centre)
     longer = focal_length.scaled_cameras(NEAR[None], zoom)
-    assert longer[0].tolist() == [
-        [150.0 * zoom.exp().item(), 0, 119.5],
-        [0, 150.0 * zoom.exp().item(), 89.5],
-        [0, 0, 1],
-    ]
+    focal = 150.0 * zoom.exp().item()
+    assert longer[0].tolist() == [[focal, 0, 119.5], [0, focal, 89.5], [0, 0, 1]]
     before, after = (
         projected(centre[None], pose, K)[0] for pose, K in ((T, NEAR[None]), (moved, longer))
     )
     assert_close(before, after)
     turn = focal_length._motion_with_focal_length(T, centre)[0, :3] * 0.01
-    assert rotation_error(moved[0, :3, :3], T[0, :3, :3]) == pytest.approx(
-        float(torch.rad2deg(turn.norm())), rel=0.02
-    )
+    error = rotation_error(moved[0, :3, :3], T[0, :3, :3])
+    assert error == pytest.approx(float(torch.rad2deg(turn.norm())), rel=0.02)
 
 
 def test_derivative_by_the_focal_length():
@@ -105,9 +105,8 @@ def test_points_of_the_surface_show_the_focal_length_without_edges(wrong):
     uv = pixels(model, T, K)
     matches = PointMatches(model, uv, torch.ones(uv.shape[:2], dtype=torch.float64))
     start = focal_length.moved_away(T, double([wrong]).log(), problem.centre)
-    none = torch.zeros(1, dtype=torch.float64)
-    prior = focal_length.FocalPrior(none, 1e3, none - 2.0, none + 2.0)
-    found = focal_length.fit_focal_length(problem, start, prior, FULL_SIZE_RADII, matches)
+    prior = prior_within(2.0, 1e3)
+    found = fit(problem, start, prior, matches)
     assert wrong * float(found.log_zoom.exp()) == pytest.approx(1.0, abs=2e-3)
     assert rotation_error(found.state.T[0, :3, :3], T[0, :3, :3]) < 0.1
     exact, _ = focal_length.focal_information(found.problem, found.state, 2.0, matches)
@@ -116,9 +115,7 @@ def test_points_of_the_surface_show_the_focal_length_without_edges(wrong):
     half = focal_length.focal_information(found.problem, found.state, 2.0, matches.scaled(0.5))[0]
     assert float(half.amount) == pytest.approx(0.5 * float(exact.amount), rel=1e-3)
     uv[:, ::4] += 12.0  # wrong matches, beyond the scale of the weights
-    robust = focal_length.fit_focal_length(
-        problem, start, prior, FULL_SIZE_RADII, replace(matches, uv=uv)
-    )
+    robust = fit(problem, start, prior, replace(matches, uv=uv))
     assert float(robust.log_zoom) == pytest.approx(float(found.log_zoom), abs=0.01)
 
 
@@ -131,10 +128,8 @@ def test_points_of_the_surface_show_the_focal_length_without_edges(wrong):
 )
 def test_a_narrow_prior_or_a_limit_holds_the_focal_length(deviation, limit, is_moved, expected):
     problem, T = near_problem(1.35)
-    none = torch.zeros(1, dtype=torch.float64)
-    prior = focal_length.FocalPrior(none, deviation, none - limit, none + limit)
     start = focal_length.moved_away(T, double([1.35]).log(), problem.centre) if is_moved else T
-    assert float(fit(problem, start, prior).log_zoom) == expected
+    assert float(fit(problem, start, prior_within(limit, deviation)).log_zoom) == expected
 
 
 def test_the_pull_of_a_prior_does_not_grow_beyond_its_reach():

@@ -35,7 +35,7 @@ from tests._support import (
 )
 
 SIZE = (360, 480)
-K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
+K = camera_matrix(520.0, 520.0, 239.5, 179.5)
 
 
 def carton(seed=0):

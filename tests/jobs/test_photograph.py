@@ -16,7 +16,7 @@ from curvireg_torch.data import Photo
 from curvireg_torch.jobs import photograph
 from curvireg_torch.jobs.entry import Entry, prepare
 from curvireg_torch.jobs.outputs import MARKER
-from tests._support import found_in, learned_registrar, refused, scene, two_trucks
+from tests._support import degrees_off, found_in, learned_registrar, refused, scene, two_trucks
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, write_files
 
@@ -57,9 +57,9 @@ def test_register_equals_the_command_to_the_last_digit_and_saves_its_files(
 @pytest.mark.slow
 def test_register_takes_pictures_of_other_kinds(folder, result):
     registrar = learned_registrar()
+    four = np.array(FOUR)
     with Image.open(folder / "photos" / "0.png") as picture:
         pixels = np.array(picture.convert("RGB"))
-        four = np.array(FOUR)
         for image, camera in (
             (picture, cr.camera_matrix(*four)),
             (pixels, four),
@@ -72,9 +72,8 @@ def test_register_takes_pictures_of_other_kinds(folder, result):
 @pytest.mark.slow
 def test_register_detects_the_object_without_a_box(folder):
     found = cr.register(folder / "photos" / "0.png", learned_registrar(), camera=FOUR)
-    assert cr.rotation_error(found.rotation, scene(0)[2][:3, :3]) < 5
-    expected = torch.tensor(BOX)
-    assert (found.box - expected).abs().max() < 12
+    assert degrees_off(found, scene(0)[2]) < 5
+    assert (found.box - torch.tensor(BOX)).abs().max() < 12
 
 
 def test_register_takes_the_camera_from_exif(folder):

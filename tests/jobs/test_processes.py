@@ -79,13 +79,9 @@ def case(request, tmp_path):
         for seed in range(3)
         for mesh in ("truck.ply", "other.ply")
     ]
+    rows.append(["none.png", "", "", "", "", "truck.ply"])
     (tmp_path / "other.ply").write_bytes((tmp_path / "truck.ply").read_bytes())
-    path = written(
-        tmp_path / "list.csv",
-        "photo,x0,y0,x1,y1,mesh",
-        *rows,
-        ["none.png", "", "", "", "", "truck.ply"],
-    )
+    path = written(tmp_path / "list.csv", "photo,x0,y0,x1,y1,mesh", *rows)
     return ["register", "--list", path], list_results
 
 
@@ -136,17 +132,7 @@ def test_strict_ends_with_its_code_for_several_processes_too(tmp_path, photos, c
     """Nothing is calibrated here, so that no result is reliable."""
     write_files(tmp_path)
     files = [tmp_path / "photos" / name for name in photos]
-    done = run(
-        [
-            "register",
-            *files,
-            tmp_path / "truck.safetensors",
-            "--strict",
-            "--jobs",
-            "2",
-            "--out",
-            tmp_path / "out",
-        ]
-    )
+    files.append(tmp_path / "truck.safetensors")
+    done = run(["register", *files, "--strict", "--jobs", "2", "--out", tmp_path / "out"])
     assert (done.returncode, "Traceback" in done.stderr) == (code, False), done.stderr
     assert (tmp_path / "out" / "results.csv").is_file()

@@ -41,18 +41,24 @@ def numbers(path):
     return iter(" ".join(lines).split())
 
 
-def points(words, count, columns):
+def points(words, columns):
+    """The number of points, and these."""
+    count = int(next(words))
     return np.array([float(next(words)) for _ in range(count * columns)]).reshape(count, columns)
+
+
+def read_body(folder):
+    return cv2.FileStorage(str(folder / "object.yaml"), cv2.FILE_STORAGE_READ)
 
 
 def read_cao(path):
     words = numbers(path)
     assert next(words) == "V1"
-    vertices = points(words, int(next(words)), 3)
+    vertices = points(words, 3)
     assert next(words) == next(words) == "0"
-    polygons = []
-    for _ in range(int(next(words))):
-        polygons.append([int(next(words)) for _ in range(int(next(words)))])
+    polygons = [
+        [int(next(words)) for _ in range(int(next(words)))] for _ in range(int(next(words)))
+    ]
     assert [*words] == ["0", "0"]
     return vertices, polygons
 
@@ -64,10 +70,10 @@ def test_m3t_reads_the_pose_in_metres_and_the_mesh_in_its_unit(tmp_path):
     assert_allclose(T[:3, :3], DOCUMENT["rotation"], atol=1e-9)
     assert_allclose(T[:3, 3], [0.03, -0.02, 0.9])
     assert T[3].tolist() == [0, 0, 0, 1]
-    body = cv2.FileStorage(str(tmp_path / "object.yaml"), cv2.FILE_STORAGE_READ)
+    body = read_body(tmp_path)
     assert body.getNode("geometry_unit_in_meter").real() == pytest.approx(0.001)
-    assert body.getNode("geometry_counterclockwise").real() == 1
-    assert body.getNode("geometry_enable_culling").real() == 1
+    for name in ("counterclockwise", "enable_culling"):
+        assert body.getNode(f"geometry_{name}").real() == 1
     np.testing.assert_array_equal(body.getNode("geometry2body_pose").mat(), np.eye(4))
     mesh = load_mesh(tmp_path / body.getNode("geometry_path").string(), unit="mm")
     assert_allclose(mesh.bounds, box().bounds)
@@ -78,8 +84,7 @@ def test_m3t_shows_both_sides_of_an_open_surface(tmp_path):
     mesh = box()
     mesh.update_faces(np.arange(10))
     write_start("m3t", tmp_path, mesh, DOCUMENT)
-    body = cv2.FileStorage(str(tmp_path / "object.yaml"), cv2.FILE_STORAGE_READ)
-    assert body.getNode("geometry_enable_culling").real() == 0
+    assert read_body(tmp_path).getNode("geometry_enable_culling").real() == 0
 
 
 def test_visp_reads_polygons_counter_clockwise_from_outside(tmp_path):
@@ -97,12 +102,10 @@ def test_visp_reads_polygons_counter_clockwise_from_outside(tmp_path):
 def test_visp_finds_the_pose_from_points_and_reads_it(tmp_path):
     write_start("visp", tmp_path, box(), DOCUMENT)
     words = numbers(tmp_path / "object.init")
-    count = int(next(words))
-    model = points(words, count, 3)
-    assert int(next(words)) == count
-    pixels = points(words, count, 2)[:, ::-1].copy()  # row and column
+    model = points(words, 3)
+    pixels = points(words, 2)[:, ::-1].copy()  # row and column
     assert not [*words]
-    assert count == 8, "the corners of the box"
+    assert len(model) == len(pixels) == 8, "the corners of the box"
     found, angle, translation = cv2.solvePnP(model, pixels, np.array(K), None)
     assert found
     assert_allclose(angle[:, 0], ANGLE, atol=1e-4)

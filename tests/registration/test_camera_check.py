@@ -2,6 +2,7 @@
 
 import math
 from functools import cache
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -15,13 +16,14 @@ from curvireg_torch.registration.camera import focal_contradiction
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support import learned_registrar, seeded, seen_from
+from tests._support.spies import spied
 
 SIZE = (360, 480)
 FOCAL = 400.0
 
 
 def camera(factor):
-    return camera_matrix(factor * FOCAL, factor * FOCAL, 239.5, 179.5, dtype=torch.float64)
+    return camera_matrix(factor * FOCAL, factor * FOCAL, 239.5, 179.5)
 
 
 @cache
@@ -35,10 +37,8 @@ def near_photograph():
 def registered(factor):
     """The result of a camera that is wrong by a factor, and what was given to measure that."""
     image, box = near_photograph()
-    given = []
-    measure = camera_module.focal_gaps
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(camera_module, "focal_gaps", lambda *a: given.append(a) or measure(*a))
+        given = spied(patch, camera_module, "focal_gaps")
         return learned_registrar()([image], box[None], camera(factor))[0], given[0]
 
 
@@ -135,14 +135,13 @@ def test_a_print_that_is_not_found_is_no_evidence(monkeypatch, matches):
 @pytest.mark.parametrize("keypoints", [0.0, 0.1])
 def test_prints_are_those_of_photographs_in_which_keypoints_count(monkeypatch, keypoints):
     image, box = near_photograph()
-    given = []
     nothing = torch.zeros(1)
+    measure = Mock(return_value=(nothing, nothing))
     monkeypatch.setattr(Block, "printed", lambda *_: keypoints)
-    monkeypatch.setattr(
-        camera_module, "focal_gaps", lambda *a: given.append(a[-1]) or (nothing, nothing)
-    )
+    monkeypatch.setattr(camera_module, "focal_gaps", measure)
     learned_registrar()([image], box[None], camera(1.0))
-    assert torch.cat(given).tolist() == [keypoints > 0.0]
+    *_, printed = measure.call_args.args
+    assert printed.tolist() == [keypoints > 0.0]
 
 
 def test_contradictions_need_a_clear_focal_length_two_deviations_and_a_distance_that_matters():

@@ -23,9 +23,8 @@ def frame_of(target, box):
 
 def described(target, T, *frames):
     """A photograph in frames, whose descriptor is that of the pose T (4, 4) in the last one."""
-    (field,), _ = target.describer.seen_by(
-        T[None], (frames[-1].transform @ CAMERA)[None], shaded=False
-    )
+    camera = (frames[-1].transform @ CAMERA)[None]
+    (field,), _ = target.describer.seen_by(T[None], camera, shaded=False)
     count = len(frames)
     return Described(
         query=None,

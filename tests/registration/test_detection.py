@@ -195,7 +195,7 @@ def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail(registra
     """In a wide camera: the hint holds at the truck, and nowhere at the other proposals, which come
     first."""
     image, box = pasted_scene(5, (200, 120), 0.45)
-    K = cr.camera_matrix(150.0, 150.0, 159.5, 119.5, dtype=torch.float64)
+    K = cr.camera_matrix(150.0, 150.0, 159.5, 119.5)
     alone = registrar([image], box[None], K)[0]
     prior = PosePrior(rotation=alone.rotation, within=2.0)
     far = torch.tensor([[4.0, 4.0, 44.0, 44.0], [4.0, 190.0, 44.0, 230.0]])

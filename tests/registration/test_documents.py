@@ -27,16 +27,11 @@ REGISTRAR = SimpleNamespace(
 
 def test_result_document_leaves_out_terms_that_did_not_compare_a_view():
     document = result_document(registration(), REGISTRAR, {"bank": 1.0})
-    assert [list(pose["terms"]) for pose in document["hypotheses"]] == [
-        ["hog", "appearance"],
-        ["hog"],
-    ]
-    assert [pose["score"] for pose in document["hypotheses"]] == pytest.approx([0.7, 0.6])
-    assert (document["bank_views"], document["unit"], document["seconds"]) == (
-        2,
-        "mm",
-        {"bank": 1.0},
-    )
+    first, second = document["hypotheses"]
+    assert (list(first["terms"]), list(second["terms"])) == (["hog", "appearance"], ["hog"])
+    assert (first["score"], second["score"]) == pytest.approx((0.7, 0.6))
+    assert (document["bank_views"], document["unit"]) == (2, "mm")
+    assert document["seconds"] == {"bank": 1.0}
     assert document["symmetries"] == 3
     assert "3 orientations" in remarks(document)[0]
     json.dumps(document, allow_nan=False)
@@ -46,19 +41,15 @@ def test_detection_document_reports_the_score_of_the_most_certain_instance():
     boxes = torch.tensor([[1.0, 2, 30, 40], [50, 2, 80, 40]]).double()
     responses = torch.tensor([7.0, 6.5])
     found = [
-        Detection(box, p, r, boxes, responses)
-        for box, p, r in zip(boxes, (0.9, 0.4), (7.0, 6.5), strict=True)
+        registration(detection=Detection(box, score, 7.0, boxes, responses), confidence=0.5 * score)
+        for box, score in zip(boxes, (0.9, 0.4), strict=True)
     ]
-    document = detection_document(
-        [registration(detection=one, confidence=0.5 * one.score) for one in found]
-    )
+    document = detection_document(found)
     assert document["score"] == 0.9
-    assert [(one["score"], one["confidence"]) for one in document["instances"]] == [
-        (0.9, 0.45),
-        (0.4, 0.2),
-    ]
-    assert [one["box"] for one in document["proposals"]] == boxes.tolist()
-    assert [one["response"] for one in document["proposals"]] == [7.0, 6.5]
+    instances = [(one["score"], one["confidence"]) for one in document["instances"]]
+    assert instances == [(0.9, 0.45), (0.4, 0.2)]
+    proposals = [(one["box"], one["response"]) for one in document["proposals"]]
+    assert proposals == [*zip(boxes.tolist(), [7.0, 6.5], strict=True)]
 
 
 def test_lines_of_results_jsonl_keep_their_keys():

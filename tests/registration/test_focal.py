@@ -72,7 +72,7 @@ def test_focal_lengths_with_small_deviations_are_right():
     for seed in range(6):
         generator = seeded(seed)
         focal = 640 * (0.7, 1.0, 1.4)[seed % 3]
-        K = camera_matrix(focal, focal, 319.5, 239.5, dtype=torch.float64)
+        K = camera_matrix(focal, focal, 319.5, 239.5)
         T = random_pose(mesh, K, size, generator, elevations=(5.0, 50.0))
         near = double([0.0, 0.0, 2.5 * describer.radius])
         T[:3, 3] = near - T[:3, :3] @ describer.centre

@@ -21,7 +21,7 @@ from curvireg_torch.registration.photograph import as_photograph
 from tests._support import answer_of, double, errors, eye, learned_registrar, scene, slow_after
 
 SQUARE = torch.from_numpy(trimesh.creation.box((1.0, 1.0, 0.001)).vertices.copy())
-K = camera_matrix(100.0, 100.0, 49.5, 39.5, dtype=torch.float64)
+K = camera_matrix(100.0, 100.0, 49.5, 39.5)
 
 
 def at(x, y, z):

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -8,10 +6,8 @@ from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.rendering.visibility import FaceTests
 from curvireg_torch.rendering.zbuffer import DeviceRenderer
 from curvireg_torch.synthetic import example_mesh
-from curvireg_torch.terms import Appearance
-from tests._support import CAMERA, exact_registrar, learned_registrar, scene
+from tests._support import CAMERA, answer_to, bank_around, exact_registrar, learned_registrar, scene
 
-VIEWS = cr.sample_views(azimuth_step=45, elevations=[0, 30])
 AGREES = 0.05  # degrees
 
 
@@ -24,8 +20,8 @@ def elsewhere():
 
 
 def photographs(count):
-    scenes = [scene(seed) for seed in range(count)]
-    return [image for image, _, _ in scenes], torch.stack([box for _, box, _ in scenes])
+    images, boxes, _ = zip(*(scene(seed) for seed in range(count)), strict=True)
+    return list(images), torch.stack(boxes)
 
 
 def check_agreement(results, expected):
@@ -45,19 +41,14 @@ def test_a_registration_is_computed_on_one_device(elsewhere):
 
 @pytest.mark.slow
 def test_a_bank_of_another_device_has_the_same_views(elsewhere):
-    appearance = replace(Appearance(), exhaustive_limit=4, top=3)
-    terms = tuple(
-        appearance if isinstance(term, Appearance) else term for term in cr.Pipeline().terms
+    pipeline = cr.Pipeline().with_term("appearance", exhaustive_limit=4, top=3)
+    bank, other = (
+        bank_around(example_mesh(), 45, [0, 30], pipeline=pipeline, device=device)
+        for device in ("cpu", elsewhere)
     )
-    pipeline = replace(cr.Pipeline(), terms=terms)
-    options = {"pipeline": pipeline, "image_size": 96, "progress": False}
-    bank = cr.ViewBank.build(example_mesh(), VIEWS, **options)
-    other = cr.ViewBank.build(example_mesh(), VIEWS, device=elsewhere, **options)
-    every = slice(None)
-    differs = (other.points_at(every).cpu() != bank.points_at(every)).float().mean()
-    assert float(differs) < 1e-3
-    differs = (other.silhouettes_at(every).cpu() != bank.silhouettes_at(every)).float().mean()
-    assert float(differs) < 1e-3
+    for name in ("points_at", "silhouettes_at"):
+        here, there = (getattr(each, name)(slice(None)).cpu() for each in (bank, other))
+        assert float((here != there).float().mean()) < 1e-3
     torch.testing.assert_close(other.boxes.cpu(), bank.boxes)
     error = (other.descriptors.cpu() - bank.descriptors).abs()
     assert (error > 5e-3).float().mean() < 1e-3  # a pixel of an edge more or less
@@ -78,5 +69,4 @@ def test_photographs_in_a_block_have_the_poses_that_they_have_alone(monkeypatch)
     describer.view_renderer = DeviceRenderer(example_mesh(), "cpu")
     together = registrar(images, boxes, CAMERA)
     check_agreement(together, expected)
-    alone = [registrar(images[k : k + 1], boxes[k : k + 1], CAMERA)[0] for k in range(3)]
-    check_agreement(alone, together)
+    check_agreement([answer_to(seed, registrar) for seed in range(3)], together)

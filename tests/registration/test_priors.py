@@ -121,7 +121,7 @@ def test_poses_are_turned_into_all_limits_about_their_centre():
 def test_no_hypothesis_exceeds_combined_limits_by_more_than_the_fit_may(seed):
     """In a wide camera, whose ray through the box is not that through the object's centre."""
     image, box, _ = scene(seed)
-    K = camera_matrix(90.0, 90.0, 200.0, 150.0, dtype=torch.float64)
+    K = camera_matrix(90.0, 90.0, 200.0, 150.0)
     prior = PosePrior(azimuth=(20.0, 40.0), elevation=(20.0, 40.0), theta=(-40.0, 40.0))
     for registrar, tolerance in ((truck_registrar(contours=False), 0.01), (truck_registrar(), 3.0)):
         for hypothesis in registrar([image], box[None], K, prior=prior)[0].hypotheses:

@@ -65,10 +65,7 @@ def registered(benchmark, case):
     bank = cr.ViewBank.build(mesh, pipeline=pipeline, progress=False)
     registrar = cr.Registrar(bank, mesh_is="exact" if benchmark.gives_camera else "similar")
     for entry, known in chosen:
-        yield (
-            known,
-            registrar([read_image(entry.photo)], torch.tensor(entry.box)[None], entry.camera)[0],
-        )
+        yield known, registrar([read_image(entry.photo)], [entry.box], entry.camera)[0]
 
 
 @pytest.mark.parametrize("case", EXACT, ids=lambda case: case.name)
@@ -78,13 +75,11 @@ def test_poses_of_exact_meshes(case):
     benchmark = BOPBenchmark(BOPDataset(real_data(f"bop/{case.name}")), protocol)
     for key, (known, result) in zip(case.keys, registered(benchmark, case), strict=True):
         symmetries = symmetry_transforms(known["model_info"])[:, :3, :3]
-        R = result.rotation.double()
         t = known["translation"].double()
-        error = float(
-            symmetric_rotation_error(R[None], known["rotation"].double()[None], symmetries)[0]
-        )
+        R = known["rotation"].double()
+        error = float(symmetric_rotation_error(result.rotation[None], R[None], symmetries)[0])
         assert error < case.rotation, f"{key}: {error:.1f} degrees"
-        shift = (result.translation.double() - t) / t[2]
+        shift = (result.translation - t) / t[2]
         assert shift[:2].norm() < case.sideways, f"{key}: {shift.tolist()} of the distance"
         assert abs(float(shift[2])) < case.depth, f"{key}: {shift.tolist()} of the distance"
 
@@ -95,12 +90,11 @@ def test_viewpoints_of_similar_meshes(case):
     dataset = Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0, categories=[case.name])
     benchmark = Pascal3DBenchmark(dataset, Protocol(pose="upright"))
     for key, (known, result) in zip(case.keys, registered(benchmark, case), strict=True):
-        error = float(rotation_error(result.rotation.double(), known["rotation"].double()))
+        R = known["rotation"].double()
+        error = float(rotation_error(result.rotation, R))
         assert error < case.rotation, f"{key}: {error:.1f} degrees"
-        reported = cr.rotation_from_viewpoint(
-            *(torch.as_tensor(v, dtype=torch.float64) for v in result.viewpoint)
-        )
-        assert rotation_error(reported, known["rotation"].double()) < case.rotation, key
+        reported = cr.rotation_from_viewpoint(*map(torch.tensor, result.viewpoint))
+        assert rotation_error(reported.double(), R) < case.rotation, key
         assert result.translation is None
 
 
@@ -116,12 +110,8 @@ def cube():
     ]
     images = [read_image(folder / "frames" / f"{name}.jpg") for name, _ in truth]
     registrar = cr.Registrar(cr.load_mesh(folder / "mesh.ply", unit="mm"))
-    return (
-        registrar,
-        cr.camera_matrix(*(K[name] for name in ("fx", "fy", "cx", "cy"))),
-        images,
-        poses,
-    )
+    K = cr.camera_matrix(*(K[name] for name in ("fx", "fy", "cx", "cy")))
+    return registrar, K, images, poses
 
 
 def is_right(registrar, result, T):

@@ -3,7 +3,6 @@ generated sequences."""
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import torch
 import trimesh
 
 from curvireg_torch import camera_matrix
-from curvireg_torch.errors import ImageError, LostObjectError
+from curvireg_torch.errors import LostObjectError
 from curvireg_torch.fitting import regions
 from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.edges import CROP_SIZE
@@ -36,7 +35,7 @@ from curvireg_torch.synthetic import example_mesh
 from tests._support import CAMERA, double, eye, refused, seeded, sequence, uniform
 from tests.fitting.cube import cube, pose
 
-K = camera_matrix(500.0, 500.0, 159.5, 119.5, dtype=torch.float64)
+K = camera_matrix(500.0, 500.0, 159.5, 119.5)
 SIZE = (240, 320)
 START = pose([0.4, 0.5, 0.1], [0.0, 0.0, 6.0])
 WINDOW_K = double([[[400.0, 0, 127.5], [0, 400.0, 127.5], [0, 0, 1]]])
@@ -322,13 +321,3 @@ def test_histograms_are_smoothed_along_each_channel():
         above = torch.stack([*levels[1:], levels[-1]], dim=axis)
         expected = 0.6 * expected + 0.2 * (below + above)
     assert torch.allclose(regions._smooth(counts.flatten(2)), expected.flatten(2))
-
-
-def test_a_prediction_among_unusable_pixels_does_not_hide_another():
-    def fit(_image, _K, T):
-        if T == "beside":
-            raise ImageError("pixels outside [0, 1]")
-        return SimpleNamespace(confidence=0.5)
-
-    guesses = SimpleNamespace(predictions=lambda: ["right", "beside"], _fit=fit, reliable=0.9)
-    assert Tracker.track(guesses, None, None).confidence == 0.5

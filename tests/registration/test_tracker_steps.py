@@ -4,10 +4,12 @@ import math
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
 
+from curvireg_torch.errors import ImageError
 from curvireg_torch.fitting.contour_problem import ContourState
 from curvireg_torch.fitting.least_squares import PointMatches
 from curvireg_torch.fitting.regions import RegionModel
@@ -26,11 +28,11 @@ def at(x=0.0, z=5.0):
 
 
 HULL = 0.5 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+PLATE = HULL * torch.tensor([1.0, 1.0, 0.0])
 
 
 def test_boxes_of_meshes_outside_the_image_mean_nothing():
     """A plate of 40 px, at pixels of its centre; and a cube that reaches behind the camera."""
-    plate = HULL * torch.tensor([1.0, 1.0, 0.0])
     half = 20.0
     for pixel, visible in (
         (99.5, True),
@@ -39,7 +41,7 @@ def test_boxes_of_meshes_outside_the_image_mean_nothing():
         (199.5 + half - 0.1, True),
         (199.5 + half + 0.1, False),
     ):
-        boxes, found = boxes_at(plate, at(x=(pixel - 99.5) / 40.0), K[None], SIZE)
+        boxes, found = boxes_at(PLATE, at(x=(pixel - 99.5) / 40.0), K[None], SIZE)
         assert found.tolist() == [visible], pixel
         assert float(boxes[0, 0]) < float(boxes[0, 2])
     for z, visible in ((0.6, True), (0.4, False), (-5.0, False)):
@@ -88,7 +90,7 @@ def fitted(monkeypatch, keyframes, last, shift=100.0, *, stale=False):
         _step=step,
         _tracked=tracked,
         centre=torch.zeros(3).double(),
-        hull=HULL * torch.tensor([1.0, 1.0, 0.0]),
+        hull=PLATE,
     )
     image = None
     Tracker._fit(follow, image, K, at())
@@ -150,16 +152,23 @@ def test_features_in_closed_form():
         assert features(*given) == pytest.approx(dict(zip(names, (0.4, *expected), strict=True)))
 
 
+UNUSABLE = ImageError("pixels outside [0, 1]")
+
+
 @pytest.mark.parametrize(
-    ("confidences", "expected"), [([0.5, 0.8], 0.8), ([0.8, 0.5], 0.8), ([0.95, 0.99], 0.95)]
+    ("found", "expected"),
+    [
+        ([0.5, 0.8], 0.8),
+        ([0.8, 0.5], 0.8),
+        ([0.95, 0.99], 0.95),
+        ([0.5, UNUSABLE], 0.5),
+        ([UNUSABLE, 0.5], 0.5),
+    ],
 )
-def test_the_prediction_that_convinces_ends_the_search_else_the_best_counts(confidences, expected):
-    guesses = dict(zip("ab", confidences, strict=True))
-    follow = SimpleNamespace(
-        reliable=0.9,
-        predictions=lambda: list(guesses),
-        _fit=lambda _, __, T: SimpleNamespace(confidence=guesses[T]),
-    )
+def test_the_prediction_that_convinces_ends_the_search_else_the_best_counts(found, expected):
+    """One among unusable pixels does not hide another."""
+    fits = Mock(side_effect=[x if x is UNUSABLE else SimpleNamespace(confidence=x) for x in found])
+    follow = SimpleNamespace(reliable=0.9, predictions=lambda: "ab", _fit=fits)
     nothing = None
     assert Tracker.track(follow, nothing, nothing).confidence == expected
 
@@ -173,24 +182,23 @@ def test_starting_again_forgets_what_was_seen(monkeypatch):
     follow = Tracker(contours, HULL)
     monkeypatch.setattr(follow, "_learn", lambda *_: None)
     monkeypatch.setattr(follow, "_remember", lambda *_: follow._keyframes.append(None))
-    poses = {
-        x: SimpleNamespace(state=SimpleNamespace(T=at(x)), frame=SimpleNamespace(K=K))
+    seen = [
+        SimpleNamespace(state=SimpleNamespace(T=at(x)), frame=SimpleNamespace(K=K))
         for x in (0, 1, 3)
-    }
-    for seen in poses.values():
-        given = seen
-        follow.accept(given)
+    ]
+    for measurement in seen:
+        follow.accept(measurement)
     predicted, last = follow.predictions()
     assert float(last[0, 0, 3]) == 3.0
     assert float(predicted[0, 0, 3]) == pytest.approx(5.0)
     regions = follow._regions
-    monkeypatch.setattr(follow, "measure", lambda *_: poses[1])
+    monkeypatch.setattr(follow, "measure", lambda *_: seen[1])
     nothing = None
     follow.start(nothing, nothing, nothing)
     assert [float(T[0, 0, 3]) for T in follow.predictions()] == [1.0]
     assert len(follow._keyframes) == 1
+    assert type(follow._regions) is RegionModel
     assert follow._regions is not regions
-    assert isinstance(follow._regions, RegionModel)
 
 
 def test_a_turn_goes_on_about_the_axes_of_the_camera():

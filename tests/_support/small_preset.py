@@ -1,0 +1,18 @@
+"""Fixtures of tests of commands that register many photographs, for a ``conftest.py``."""
+
+import pytest
+
+from curvireg_torch.pipeline import DEFAULT, PRESETS
+from tests._support.small import SMALL
+
+
+@pytest.fixture(scope="session")
+def banks(tmp_path_factory):
+    """A cache that the tests share."""
+    return tmp_path_factory.mktemp("banks")
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch, banks):
+    monkeypatch.setitem(PRESETS, DEFAULT, SMALL)
+    monkeypatch.setenv("CURVIREG_CACHE", str(banks))
