@@ -90,19 +90,19 @@ def errors(result, T):
 
 
 @cache
-def sequence(count):
-    """Photographs, boxes and poses: 4 degrees about a vertical axis and 2 % nearer from frame to
-    frame."""
+def frame(number):
+    """A photograph of a sequence, its box and pose: 4 degrees about a vertical axis and 2 % nearer
+    from frame to frame."""
     T = scene(0)[2]
-    step = rotation_from_axis_angle(double([0.0, 0.07, 0.0]))
-    frames = []
-    for _ in range(count):
-        generator = seeded(9)
-        frames.append((*synthesize_photograph(example_mesh(), T, CAMERA, SIZE, generator), T))
-        T = T.clone()
-        T[:3, :3] = step @ T[:3, :3]
+    if number > 0:
+        T = frame(number - 1)[2].clone()
+        T[:3, :3] = rotation_from_axis_angle(double([0.0, 0.07, 0.0])) @ T[:3, :3]
         T[:3, 3] *= 0.98
-    return frames
+    return (*synthesize_photograph(example_mesh(), T, CAMERA, SIZE, seeded(9)), T)
+
+
+def sequence(count):
+    return [frame(number) for number in range(count)]
 
 
 def unrefined(bank, **changes):
@@ -156,6 +156,7 @@ def found_in(registrar, image, boxes):
 
 def two_trucks():
     """A photograph (3, H, 2 W) of two trucks side by side, and their boxes."""
-    (left, first, _), (right, second, _) = scene(0), scene(1)
+    left, first, _ = scene(0)
+    right, second, _ = scene(1)
     shift = torch.tensor([SIZE[1], 0.0, SIZE[1], 0.0])
     return torch.cat([left, right], dim=2), [first, second + shift]

@@ -13,14 +13,14 @@ BOX = torch.tensor([10.0, 20.0, 110.0, 70.0])
 
 
 def test_parse_and_str_are_inverse():
-    boxes = {
+    for words, box in {
         "": "annotated",
         "box=0.2 seed=7": "0.2 seed=7",
         "box=annotated": "annotated",
         "box=none": "none",
         "box_is=visible": "annotated box_is=visible",
-    }
-    for words, box in {**boxes, "views=3 seed=2": "annotated views=3 seed=2"}.items():
+        "views=3 seed=2": "annotated views=3 seed=2",
+    }.items():
         protocol = Protocol.parse(words.split())
         text = f"cad=annotated pose=upright box={box}"
         assert (str(protocol), Protocol.parse(text.split())) == (text, protocol)
@@ -45,17 +45,17 @@ def test_hint_of_truth_holds_the_truth_and_is_off_centre(hint):
     protocol = Protocol(hint=hint)
     degrees = protocol.hint_tolerance()[1]
     R = rotation_from_viewpoint(torch.linspace(0, 350, 30, dtype=torch.float64), 20.0) @ frame
-    missed = torch.stack(
-        [hint_of_truth(r, frame, protocol, str(i)).excess(r, frame) for i, r in enumerate(R)]
-    )
+    hints = [hint_of_truth(r, frame, protocol, str(i)) for i, r in enumerate(R)]
+    missed = torch.stack([hint.excess(r, frame) for hint, r in zip(hints, R, strict=True)])
     assert missed.max() <= 0.0
     assert missed.min() >= -degrees
     assert missed.std() > 0.15 * degrees
     assert missed.max() > -0.25 * degrees, "offsets fill the range"
-    assert hint_of_truth(R[0], frame, protocol, "a") == hint_of_truth(R[0], frame, protocol, "a")
-    assert hint_of_truth(R[0], frame, protocol, "a") != hint_of_truth(
-        R[0], frame, replace(protocol, seed=1), "a"
+    first, again, other = (
+        hint_of_truth(R[0], frame, one, "a")
+        for one in (protocol, protocol, replace(protocol, seed=1))
     )
+    assert first == again != other
 
 
 def test_a_seed_that_draws_nothing_is_refused():

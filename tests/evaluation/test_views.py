@@ -16,6 +16,7 @@ from curvireg_torch.geometry import transform
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.synthetic import example_mesh
 from tests._support import CAMERA, write_photo
+from tests._support.miniature import write_json
 from tests._support.small import rows_of, run
 from tests.registration.test_several import WORLD, photograph
 
@@ -42,29 +43,23 @@ def trucks(tmp_path):
             image, box, T = photograph_in_mm(azimuth)
             write_photo(folder / "rgb" / f"{number:06d}.png", image)
             x0, y0, x1, y1 = box.tolist()
-            gt[number] = [
-                {"obj_id": 1, "cam_R_m2c": flat(T[:3, :3]), "cam_t_m2c": T[:3, 3].tolist()}
-            ]
+            gt[number] = [{"obj_id": 1, **in_bop(T, "m2c")}]
             info[number] = [{"bbox_obj": [x0, y0, x1 - x0, y1 - y0], "visib_fract": 1.0}]
-            cameras[number] = {"cam_K": flat(CAMERA)}
+            cameras[number] = {"cam_K": CAMERA.flatten().tolist()}
             if scene == 1:
-                camera = T @ torch.linalg.inv(WORLD)
-                cameras[number] |= {
-                    "cam_R_w2c": flat(camera[:3, :3]),
-                    "cam_t_w2c": camera[:3, 3].tolist(),
-                }
+                cameras[number] |= in_bop(T @ torch.linalg.inv(WORLD), "w2c")
         for name, content in (("gt", gt), ("gt_info", info), ("camera", cameras)):
-            (folder / f"scene_{name}.json").write_text(json.dumps(content))
-    (root / "models").mkdir()
+            write_json(folder / f"scene_{name}.json", content)
     mesh = example_mesh().apply_scale(1000.0)
+    models = {"1": {"diameter": 2.0 * mesh_radius(mesh)}}
+    write_json(root / "models" / "models_info.json", models)
     mesh.export(root / "models" / "obj_000001.ply")
-    diameter = 2.0 * mesh_radius(mesh)
-    (root / "models" / "models_info.json").write_text(json.dumps({"1": {"diameter": diameter}}))
     return BOPDataset(root)
 
 
-def flat(matrix):
-    return matrix.flatten().tolist()
+def in_bop(T, frames):
+    """A rigid transform as files of BOP have it."""
+    return {f"cam_R_{frames}": T[:3, :3].flatten().tolist(), f"cam_t_{frames}": T[:3, 3].tolist()}
 
 
 def drawn_by(benchmark):
@@ -140,14 +135,13 @@ def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
     summary = run(benchmark, tmp_path / "out")
     assert summary["protocol"] == "cad=annotated pose=any box=annotated views=3 seed=0"
     assert (summary["n"], summary["failed"], summary["skipped"]) == (7, 0, {"unreadable_image": 1})
-    rows = [
-        row for row in rows_of(benchmark, tmp_path / "out").values() if row["verdict"] != "failed"
-    ]
     failures = Counter()
-    for row in rows:
-        assert len(row["photographs"]) == 3
-        assert_allclose(row["photographs"][0]["rotation"], row["rotation"])
-        assert_allclose(row["photographs"][0]["translation"], row["translation"])
+    for row in rows_of(benchmark, tmp_path / "out").values():
+        if row["verdict"] == "failed":
+            continue
+        first, _, _ = row["photographs"]
+        assert_allclose(first["rotation"], row["rotation"])
+        assert_allclose(first["translation"], row["translation"])
         failures.update(view["failure"] is not None for view in row["photographs"])
     others = [entry for entry in benchmark.entries if entry.photo != broken]
     drawn = sum(view.photo == broken for entry in others for view in entry.views)

@@ -4,14 +4,15 @@ import io
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
+import torch
 import trimesh
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError
 from curvireg_torch.pipeline import BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
+from tests._support import write_photo
 
 QUICK = replace(
     Pipeline(),
@@ -22,17 +23,22 @@ QUICK = replace(
 
 @pytest.fixture
 def inspect(tmp_path, monkeypatch):
-    """Runs the command with few views; returns its exit code and the folder of the report."""
+    """Runs the command on a mesh in metres, with few views; returns its exit code and the folder of
+    the report."""
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("curvireg_torch.inspection.look_alikes.LOOKED_AT", 12)
     (tmp_path / "few.json").write_text(QUICK.to_json())
 
-    def run(mesh, *words):
+    def run(name, *words):
         out = tmp_path / "out"
-        few = ["--pipeline", str(tmp_path / "few.json")]
-        return main(["inspect", str(mesh), *few, "--out", str(out), *words]), out
+        few = ["--unit", "m", "--pipeline", str(tmp_path / "few.json")]
+        return main(["inspect", str(tmp_path / name), *few, "--out", str(out), *words]), out
 
     return run
+
+
+def report_in(folder):
+    return json.loads((folder / "inspect.json").read_text())
 
 
 @pytest.mark.slow
@@ -41,9 +47,9 @@ def test_report_and_page(tmp_path, capsys, inspect, monkeypatch):
     terminal.isatty = lambda: True
     monkeypatch.setattr("sys.stderr", terminal)
     example_mesh().export(tmp_path / "truck.ply")
-    code, out = inspect(tmp_path / "truck.ply", "--unit", "m", "--n", "2", "--clutter")
+    code, out = inspect("truck.ply", "--n", "2", "--clutter")
     assert code == 0
-    document = json.loads((out / "inspect.json").read_text())
+    document = report_in(out)
     expected = document["expected"]
     assert {"n", "right", "reliable", "median_deg"} <= expected.keys()
     assert (expected["n"], expected["clutter"], expected["with_camera"]) == (2, True, True)
@@ -71,9 +77,8 @@ def test_report_and_page(tmp_path, capsys, inspect, monkeypatch):
 def test_backgrounds_are_ones_own_photographs(tmp_path, inspect, monkeypatch):
     example_mesh().export(tmp_path / "truck.ply")
     (tmp_path / "places").mkdir()
-    import cv2
-
-    cv2.imwrite(str(tmp_path / "places" / "wall.png"), np.full((60, 80, 3), (0, 0, 200), np.uint8))
+    red = torch.tensor([0.8, 0.0, 0.0])[:, None, None]
+    write_photo(tmp_path / "places" / "wall.png", red.expand(3, 60, 80))
     seen = []
 
     def trial(*arguments, **_):
@@ -81,7 +86,7 @@ def test_backgrounds_are_ones_own_photographs(tmp_path, inspect, monkeypatch):
         raise CurviregError("seen")
 
     monkeypatch.setattr("curvireg_torch.inspection.report.run_trial", trial)
-    inspect(tmp_path / "truck.ply", "--unit", "m", "--photo", str(tmp_path / "places"))
+    inspect("truck.ply", "--photo", str(tmp_path / "places"))
     red, green, blue = seen[0]
     assert red > 180
     assert green < 20
@@ -92,18 +97,18 @@ def test_a_mesh_that_cannot_work_ends_with_code_3_if_strict(tmp_path, capsys, in
     box = trimesh.creation.box((5.0, 4.0, 2.6))
     mesh = trimesh.Trimesh(box.vertices, box.faces[:, ::-1])
     mesh.export(tmp_path / "mesh.ply")
-    code, out = inspect(tmp_path / "mesh.ply", "--unit", "m", "--strict")
+    code, out = inspect("mesh.ply", "--strict")
     assert code == 3
     assert "as a room's do" in capsys.readouterr().out
-    document = json.loads((out / "inspect.json").read_text())
+    document = report_in(out)
     assert document["hopeless"]
     assert document["expected"] is None
-    assert inspect(tmp_path / "mesh.ply", "--unit", "m")[0] == 0
+    assert inspect("mesh.ply")[0] == 0
 
 
 def test_a_mesh_without_area_is_refused_in_one_line(tmp_path, capsys, inspect):
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
-    assert inspect(tmp_path / "flat.obj", "--unit", "m")[0] == 2
+    assert inspect("flat.obj")[0] == 2
     said = capsys.readouterr().err.strip().split("\n")
     assert "flat.obj" in said[-1]
     assert "Traceback" not in "".join(said)
@@ -113,9 +118,9 @@ def test_a_mesh_without_area_is_refused_in_one_line(tmp_path, capsys, inspect):
 def test_a_kilometre_and_missing_textures_are_warned_of(tmp_path, capsys, inspect):
     text = example_mesh().apply_scale(4000.0).export(file_type="obj")
     (tmp_path / "truck.obj").write_text("mtllib paint.mtl\nusemtl red\n" + text)
-    code, out = inspect(tmp_path / "truck.obj", "--unit", "m", "--n", "0")
+    code, out = inspect("truck.obj", "--n", "0")
     assert code == 0
-    warnings = json.loads((out / "inspect.json").read_text())["warnings"]
+    warnings = report_in(out)["warnings"]
     assert any("m across: is its unit really m; usual would be mm" in text for text in warnings)
     assert any("paint.mtl" in text for text in warnings)
     assert "warning:" in capsys.readouterr().out
@@ -128,8 +133,8 @@ def test_a_million_faces_take_bounded_time_and_are_said(tmp_path, inspect):
     mesh.vertices = 0.1 * mesh.vertices * stretch * (1.0, 0.8, 0.6)
     assert len(mesh.faces) > 1_000_000
     mesh.export(tmp_path / "fine.ply")
-    code, out = inspect(tmp_path / "fine.ply", "--unit", "m", "--n", "2")
+    code, out = inspect("fine.ply", "--n", "2")
     assert code == 0
-    document = json.loads((out / "inspect.json").read_text())
+    document = report_in(out)
     assert document["expected"]["n"] == 2
     assert any("1,310,720 faces: contours use 8,000" in text for text in document["warnings"])

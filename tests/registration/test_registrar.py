@@ -24,7 +24,6 @@ from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import (
-    FailedRegistration,
     Follower,
     block,
     hypotheses,
@@ -65,10 +64,7 @@ def test_poses_of_synthetic_scenes():
     """Six scenes of known truth, before and after refinement."""
     registrars = truck_registrar(contours=False), truck_registrar()
     registered = [registrar(IMAGES, torch.stack(BOXES), CAMERA) for registrar in registrars]
-    found = [
-        torch.tensor([errors(result, T) for result, T in zip(results, TRUTHS, strict=True)])
-        for results in registered
-    ]
+    found = [torch.tensor([*map(errors, results, TRUTHS)]) for results in registered]
     coarse, fine = (degrees[:, 0] for degrees in found)
     right = coarse < 20
     assert right.sum() >= 5
@@ -104,15 +100,20 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
     nan = IMAGE.clone()
     nan[1, int(BOX[1]) + 9, int(BOX[0]) + 9] = torch.nan
     grey = torch.full((3, 50, 50), 0.3)
-    four = torch.zeros(4, 9, 9)
-    images = [IMAGE, grey, nan, IMAGE, tmp_path / "none.png", IMAGE * 255, four, IMAGE]
-    boxes = torch.stack([BOX, torch.tensor([5.0, 5, 40, 40]), BOX, -BOX, BOX, BOX, BOX, BOX])
-    results = truck_registrar(contours=False)(images, boxes, CAMERA)
-    assert [result.ok for result in results] == [True, *[False] * 6, True]
-    assert results[0].rotation.equal(results[7].rotation)
-    messages = ["one colour", "NaN", "X0 < X1", "none.png: no such file", r"\[0, 1\]", "channels"]
-    for i, (result, message) in enumerate(zip(results[1:7], messages, strict=True), start=1):
-        assert isinstance(result, FailedRegistration)
+    images, boxes, messages = zip(
+        (grey, torch.tensor([5.0, 5, 40, 40]), "one colour"),
+        (nan, BOX, "NaN"),
+        (IMAGE, -BOX, "X0 < X1"),
+        (tmp_path / "none.png", BOX, "none.png: no such file"),
+        (IMAGE * 255, BOX, r"\[0, 1\]"),
+        (torch.zeros(4, 9, 9), BOX, "channels"),
+        strict=True,
+    )
+    first, *failed, last = truck_registrar(contours=False)(
+        [IMAGE, *images, IMAGE], torch.stack([BOX, *boxes, BOX]), CAMERA
+    )
+    assert first.rotation.equal(last.rotation)
+    for i, (result, message) in enumerate(zip(failed, messages, strict=True), start=1):
         with refused(f"image {i}: .*{message}", CurviregError):
             _ = result.rotation
 
@@ -195,15 +196,12 @@ def test_registrar_accepts_tensors_arrays_and_paths_and_rejects_bad_calls(tmp_pa
     cv2.imwrite(str(tmp_path / "photo.png"), array[..., ::-1])
     file = tmp_path / "photo.png"
     images = [pixels, array, array.astype("float32") / 255, file, str(file)]
-    first, *others = truck_registrar(contours=False)(images, [BOX.tolist()] * 5)
-    for result in others:
-        torch.testing.assert_close(
-            result.ranking.scores, first.ranking.scores, atol=1e-5, rtol=1e-4
-        )
     registrar = truck_registrar(contours=False)
-    no_focal = torch.diag(torch.tensor([0.0, 1, 1]))
+    first, *others = (result.ranking.scores for result in registrar(images, [BOX.tolist()] * 5))
+    for scores in others:
+        torch.testing.assert_close(scores, first, atol=1e-5, rtol=1e-4)
     with refused("focal"):
-        _ = registrar([IMAGE], BOX[None], no_focal.double())[0].rotation
+        _ = registrar([IMAGE], BOX[None], torch.diag(double([0.0, 1, 1])))[0].rotation
     for images, boxes, camera, message in (
         ([IMAGE], BOX[None], CAMERA.expand(2, 3, 3), r"expected \(3, 3\) or \(1, 3, 3\)"),
         ([IMAGE], BOX.expand(3, 4), None, r"shape \(1, 4\), one for each image, got \(3, 4\)"),
@@ -266,10 +264,9 @@ def test_progress_reports_stages_and_may_cancel(monkeypatch):
 
     with refused("cancelled in bank", InterruptedError):
         ViewBank.build(example_mesh(), views, image_size=64, progress=cancel)
-    with refused("cancelled in ranking", InterruptedError):
-        Registrar(bank, progress=cancel)([IMAGE], BOX[None])
-    with refused("cancelled in detection", InterruptedError):
-        Registrar(bank, progress=cancel)([IMAGE])
+    for boxes, stage in ((BOX[None], "ranking"), (None, "detection")):
+        with refused(f"cancelled in {stage}", InterruptedError):
+            Registrar(bank, progress=cancel)([IMAGE], boxes)
 
 
 WRONG = BOX + torch.tensor([-0.1, 0.2, 0.1, 0.15]) * (BOX[2:] - BOX[:2]).repeat(2)
@@ -360,12 +357,13 @@ def test_doubtful_photographs_are_registered_again(monkeypatch):
     nearer[2, 3] = -0.1 * float(T[2, 3])
     other = replace(right, projection=(nearer @ T, K))
     two = replace(doubtful, hypotheses=(right, other), probabilities=(0.5, 0.3))
+    same = replace(two, hypotheses=(right, right))
+    far = replace(two, probabilities=sure.probabilities)
     rough = BOX + torch.tensor([-0.04, 0.0, 0.0, 0.0]) * (BOX[2] - BOX[0])
     assert len(registered_in_boxes(monkeypatch, sure, box=rough)[1]) == 1
     assert len(registered_in_boxes(monkeypatch, doubtful, sure, box=rough)[1]) == 2
-    far = replace(two, probabilities=sure.probabilities)
-    assert len(registered_in_boxes(monkeypatch, far, sure)[1]) == 2
-    assert len(registered_in_boxes(monkeypatch, two, sure)[1]) == 2
+    for answers in ((far, sure), (two, sure), (same, doubtful)):
+        assert len(registered_in_boxes(monkeypatch, *answers)[1]) == 2
     result, boxes = registered_in_boxes(monkeypatch, two, doubtful, sure)
     given, first, second = (double(box) for box in boxes)
     torch.testing.assert_close(given, WRONG.double())
@@ -373,8 +371,6 @@ def test_doubtful_photographs_are_registered_again(monkeypatch):
     sides = torch.stack([box[2:] - box[:2] for box in (first, second)])
     torch.testing.assert_close(sides[1], sides[0] / 0.9, atol=2.0, rtol=0.0)
     torch.testing.assert_close(result.corrected_box, second)
-    same = replace(two, hypotheses=(right, right))
-    assert len(registered_in_boxes(monkeypatch, same, doubtful)[1]) == 2
 
 
 # Half-way between two views of a coarse bank, so that both lead to the same pose
@@ -453,13 +449,14 @@ def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
         return found
 
     monkeypatch.setattr(several, "_registered_to", register)
-    assert both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None]).mesh_index == 1
+    rig = [IMAGE], None, CAMERA, torch.eye(4)[None]
+    assert both.register_views(*rig).mesh_index == 1
     assert prepared.call_count == 1, "once for both meshes"
     absent.add(both.others[0])
     with refused("first", LostObjectError):
-        both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None])
+        both.register_views(*rig)
     absent.remove(both)
-    assert both.register_views([IMAGE], None, CAMERA, torch.eye(4)[None]).mesh_index == 0
+    assert both.register_views(*rig).mesh_index == 0
 
 
 def test_a_registrar_that_was_used_can_be_pickled_and_copied():

@@ -15,8 +15,7 @@ from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.photograph import Photograph
 from tests._support import CAMERA, SIZE, double, refused
-from tests._support import hypotheses as support
-from tests._support.hypotheses import all_kept, competing, evidence_of, target_of
+from tests._support.hypotheses import all_kept, competing, evidence_of, poses_at, target_of
 
 NOTHING = None
 CENTRE = double([0.3, -0.2, 0.4])
@@ -27,9 +26,9 @@ def photographed(camera, prior=None):
     return Photograph(torch.zeros(3, *SIZE), BOX, camera, prior)
 
 
-def poses_at(count):
+def poses_of(count):
     """Of the views 0, 1, ..., turned about the vertical axis."""
-    return support.poses_at(*(70.0 * number for number in range(count)), centre=CENTRE)
+    return poses_at(*(70.0 * number for number in range(count)), centre=CENTRE)
 
 
 def test_cameras_that_are_tried_have_all_fields_of_view():
@@ -67,7 +66,7 @@ def test_starts_are_the_best_view_of_each_camera_and_the_best_views():
 @pytest.mark.parametrize(("source", "factors"), [("estimated", [2, 1]), ("exif", [1])])
 def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source, factors):
     """Each fit moves the pose by 1 to the right, and adds 0.1 to log f."""
-    poses = poses_at(1)
+    poses = poses_of(1)
     fitted = []
 
     def problem(_, __, K, ___, *, factor=1):
@@ -98,10 +97,10 @@ def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source
 
 def test_the_covariance_is_that_of_the_origin(monkeypatch):
     """With the motion of the centre and the rotation about it, of an origin beside the centre."""
-    pose = replace(poses_at(1), covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
+    pose = replace(poses_of(1), covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
     motion = double([[0.02, -0.03, 0.01, 0.3, -0.1, 0.5]])
-    none = torch.ones(1, dtype=torch.float64)
-    information = FocalInformation(amount=none, scale=0.04 * none, step=none)
+    one = double([1.0])
+    information = FocalInformation(amount=one, scale=0.04 * one, step=one)
     problem = SimpleNamespace(state=lambda _: None)
     monkeypatch.setattr(camera_module.ContourProblem, "of", lambda *_: problem)
     monkeypatch.setattr(camera_module, "focal_information", lambda *_: (information, motion))
@@ -123,7 +122,7 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
 
 def refitted(monkeypatch, evidence, new, *, tried_cameras=True, outside=None):
     """Views that were fitted with their focal lengths, those that changed, and the evidence."""
-    poses = poses_at(len(evidence))
+    poses = poses_of(len(evidence))
     tried = []
 
     def fit(_, __, some, ___):
@@ -176,7 +175,7 @@ def test_fits_also_begin_from_the_focal_length_of_another_pose():
 
 def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(monkeypatch):
     """The third pose is outside the limits, and the last one of a photograph of a known camera."""
-    poses = poses_at(4)
+    poses = poses_of(4)
     poses = replace(
         poses,
         cameras=scaled_cameras(poses.cameras, double([0.0, 0.1, 0.2, 0.3])),
