@@ -18,7 +18,7 @@ from tests._support.lists import bop_poses, table
 from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
 from tests._support.tables import text_table
 
-pytestmark = pytest.mark.usefixtures("mats_here")
+MATS_HERE = pytest.mark.usefixtures("mats_here")
 ANY = Protocol(pose="any")
 
 SECONDS = {"bank": 2.0, "register": 0.5}
@@ -77,6 +77,7 @@ def furniture(tmp_path):
 
 
 def test_pascal3d_summary(furniture, tmp_path):
+    """Of annotations that a program of its own reads, as for users."""
     rotations = [("z", 90), ("z", 40), ("x", 20), None, ("z", 180), ("z", 5), ("z", 20), ("z", 180)]
     samples = furniture.samples
     pairs = zip(samples[:8], rotations, strict=True)
@@ -113,6 +114,7 @@ def test_pascal3d_summary(furniture, tmp_path):
     assert summary["settings"]["root"] == "where", "a summary is shared: no paths"
 
 
+@MATS_HERE
 def test_pascal3d_table(furniture, tmp_path):
     R = rotation_from_viewpoint(*double([200.0, 10, -5])).tolist()
     scores_of(furniture, tmp_path, [{"rotation": R}, FAILED] + [SKIPPED] * 7)
@@ -184,6 +186,7 @@ def test_cad_any_is_refused_for_objects_with_one_mesh_and_views_without_cameras(
         Pascal3DBenchmark(pascal, Protocol(views=2))
 
 
+@MATS_HERE
 @pytest.mark.parametrize("kind", ["pascal3d", "bop"])
 def test_score_without_results(tmp_path, instances, furniture, kind):
     benchmark = instances[0] if kind == "bop" else furniture
@@ -278,6 +281,7 @@ def test_detection_recall_counts_the_first_right_proposal():
     assert detection_recall([], []) == {"n": 0, **nothing}
 
 
+@MATS_HERE
 def test_the_page_marks_by_the_error_up_to_symmetries(furniture, bop, tmp_path):
     for benchmark, degrees in ((furniture, 90), (BOPBenchmark(bop, ANY), 180)):
         first = benchmark.samples[0]
@@ -371,6 +375,7 @@ def test_boxes_are_clipped_where_the_outermost_pixels_end(annotated, proposed):
     assert detection_recall([[sample(*annotated)]], [located(proposed)])["recall_1"] == 1.0
 
 
+@MATS_HERE
 def test_another_cad_of_the_class_is_drawn_by_the_seed(furniture):
     folder = furniture.dataset.root / "CAD" / "sofa"
     names = [f"{k:02d}.off" for k in range(1, 9)]

@@ -57,19 +57,20 @@ def test_the_middle_between_a_contour_and_none_is_half_of_what_shared_contours_h
     assert float(scores[2, 0]) < -1.0
 
 
-def closed_case(monkeypatch, places, *, strength=0.8, padding=None, outside=-1.0):
+def closed_case(monkeypatch, places, *, padding=None, outside=-1.0):
     """Score of the first of two poses with contour points at ``places`` in px along a line, where
-    all edges have a ``strength``; ``padding`` are places of points that are not valid, and at
+    all edges have a strength of 0.8; ``padding`` are places of points that are not valid, and at
     ``outside`` the photograph ends."""
-    rows = [[*some, *more] for some, more in zip(places, padding or [[], []], strict=True)]
-    P = max(map(len, rows))
-    x = double([row + [900.0] * (P - len(row)) for row in rows])
-    valid = torch.tensor([[k < len(some) for k in range(P)] for some in places])
+    x = torch.full((2, 60), 900.0).double()
+    valid = torch.zeros(2, 60, dtype=torch.bool)
+    for row, (some, more) in enumerate(zip(places, padding or [[], []], strict=True)):
+        x[row, : len(some) + len(more)] = double([*some, *more])
+        valid[row, : len(some)] = True
     uv = torch.stack([x, torch.zeros_like(x)], dim=-1)
     points = SimpleNamespace(model=None, normals=None, valid=valid)
     problem = SimpleNamespace(
         state=lambda _: SimpleNamespace(points=points),
-        strength_near=lambda uv, _: torch.full(uv.shape[:2], strength).double(),
+        strength_near=lambda uv, _: torch.full(uv.shape[:2], 0.8).double(),
         edges=SimpleNamespace(counts=lambda uv, valid, _: valid & (uv[..., 0] > outside)),
         K=None,
         centre=None,

@@ -50,8 +50,8 @@ def textured(*, uv=0.0, level=0, side=4):
     return mesh
 
 
-def standing(up="y"):
-    return replace(as_mesh(trimesh.creation.box()), up=up)
+def standing():
+    return replace(as_mesh(trimesh.creation.box()), up="y")
 
 
 def test_bank_key_depends_on_everything(monkeypatch):

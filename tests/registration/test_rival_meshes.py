@@ -62,12 +62,12 @@ def test_a_variant_with_a_part_more_is_told_from_that_without(with_cabin, order)
     assert result.ambiguous is None
 
 
-def result_of(similarity, confidence, rival=0.1):
+def result_of(similarity, confidence):
     made = registration(confidence=confidence)
     nothing = dict.fromkeys((field.name for field in fields(Evidence)), 0.0)
     hypotheses = tuple(
         replace(hypothesis, evidence={**nothing, "similarity": value})
-        for hypothesis, value in zip(made.hypotheses, (similarity, rival), strict=True)
+        for hypothesis, value in zip(made.hypotheses, (similarity, 0.1), strict=True)
     )
     return replace(made, hypotheses=hypotheses)
 

@@ -66,10 +66,11 @@ def moved(T, angles, shift):
     return out
 
 
-def drawn(T, inside=(0.8, 0.2, 0.2), outside=(0.2, 0.5, 0.3)):
+def drawn(T):
     """A cube of one colour on a background of another."""
     mask = make_renderer(cube()).render(T[None], K, SIZE)[0] > 0
-    return torch.where(mask, *(torch.tensor(colour)[:, None, None] for colour in (inside, outside)))
+    inside, outside = torch.tensor([[0.8, 0.2, 0.2], [0.2, 0.5, 0.3]])[..., None, None]
+    return torch.where(mask, inside, outside)
 
 
 def shift_in_pixels(T, truth):

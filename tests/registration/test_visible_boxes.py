@@ -36,11 +36,11 @@ def visible_registrar(**changes):
     return cr.Registrar(registrar.bank, pipeline=pipeline)
 
 
-def half_hidden(seed, *, by=0.45):
+def half_hidden(seed):
     """A photograph whose object is hidden from 45 % of its width on, the box of what is visible,
     and the true pose."""
     image, box, T = scene(seed)
-    end = int(box[0] + by * (box[2] - box[0]))
+    end = int(box[0] + 0.45 * (box[2] - box[0]))
     covered = image.clone()
     covered[:, :, end:] = image[:, :, end:].mean()
     return covered, torch.tensor([box[0], box[1], end - 0.5, box[3]]), T
