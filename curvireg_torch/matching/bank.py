@@ -26,7 +26,7 @@ from ..mesh.mesh import (
     mesh_radius,
     principal_rotation,
 )
-from ..mesh.reflections import reflection_plane
+from ..mesh.reflections import is_its_own_mirror_image
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
 from ..terms import Appearance
@@ -40,7 +40,7 @@ from .cells import Packing, packing_of_views
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
 FORMAT = "curvireg_torch.ViewBank"
-FORMAT_VERSION = 11
+FORMAT_VERSION = 12
 PIXELS_AT_A_TIME = 72 * 128**2  # of views that a thread holds in memory, about 60 bytes each
 TURNS = 24  # in-plane rotations of the default views: quarter turns among them share a rendering
 VIEWS_ON_DEVICE = 480  # the same on another device than the CPU
@@ -281,10 +281,6 @@ class ViewBank:
             arrays[f"{kind}.faces"] = np.array(surface.faces, np.int32)
         contents |= {name: torch.from_numpy(x.copy()) for name, x in arrays.items()}
         contents["extreme_points"] = extreme_points(self.mesh)
-        plane = reflection_plane(self.mesh)
-        contents["reflection_plane"] = (
-            torch.zeros(0, 3, dtype=torch.float64) if plane is None else plane[None]
-        )
         if not self.mesh.has_colours:
             contents["mesh_symmetries"] = mesh_symmetries(self.mesh)
         angle = self._compared_angle()
@@ -297,6 +293,7 @@ class ViewBank:
             "mesh": self.mesh.file_name,
             "unit": self.mesh.unit or "",
             "up": self.mesh.up,
+            "is_its_own_mirror_image": str(is_its_own_mirror_image(self.mesh)),
             "warnings": json.dumps([asdict(warning) for warning in self.mesh.warnings]),
             "packing": json.dumps(angle),
             "checksum": tensor_checksum(contents),
@@ -409,7 +406,7 @@ def _mesh(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> Mesh:
     measures |= {n: tensors[n] for n in ("extreme_points", "mesh_symmetries") if n in tensors}
     if len(mesh.faces) > VIEW_FACES:
         measures["view_mesh"] = _triangles(tensors, "view_mesh")
-    measures["reflection_plane"] = _plane(tensors["reflection_plane"])
+    measures["is_its_own_mirror_image"] = metadata["is_its_own_mirror_image"] == "True"
     _check_extreme_points(mesh)
     if not mesh.has_colours:
         check_symmetries(mesh_symmetries(mesh))
@@ -450,16 +447,6 @@ def _check_extreme_points(mesh: Mesh) -> None:
         torch.stack(points.aminmax(dim=0)), mesh.bounds, rtol=0.0, atol=tolerance
     ):
         raise ValueError("extreme_points: those of another mesh")
-
-
-def _plane(rows: Tensor) -> Tensor | None:
-    """The normal (3,) of a plane, (1, 3) in a file, or none, (0, 3); ValueError for what is
-    neither."""
-    check_tensor(rows, "reflection_plane", (None, 3))
-    lengths = torch.linalg.vector_norm(rows.double(), dim=1)
-    if rows.dtype != torch.float64 or not torch.allclose(lengths, lengths.new_ones(len(rows))):
-        raise ValueError("reflection_plane: expected a float64 unit vector")
-    return rows[0] if len(rows) else None
 
 
 def colour_arrays(mesh: Mesh) -> dict[str, Array]:

@@ -319,16 +319,6 @@ def format_up(suffix: str) -> str:
     return "y" if suffix.lower() in (".glb", ".gltf") else "z"
 
 
-MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
-"""The reflection that makes the mirror image of a mesh: of its x axis."""
-
-
-def mirrored(surface: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mirror image of a surface."""
-    vertices = np.asarray(surface.vertices) @ MIRROR.numpy()
-    return trimesh.Trimesh(vertices, surface.faces[:, [0, 2, 1]], process=False)
-
-
 def measure(function: Callable[[trimesh.Trimesh], Value]) -> Callable[[Any], Value]:
     """Decorate a function of a surface: a :class:`Mesh` keeps its value among its ``measures``, and
     callers get copies of tensors."""

@@ -1,5 +1,5 @@
 """Focal lengths that are not known: cameras that are tried, and a focal length that is fitted with
-the pose.
+the pose; and what a photograph says against the camera that is given.
 
 Perspective shows the focal length: near parts of an object look larger, the more so the nearer the
 camera is. Of five cameras, the one whose short fits have the most evidence is a start, from which
@@ -15,18 +15,21 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..fitting.contour_problem import ContourProblem
-from ..fitting.edges import EdgeCrops
-from ..fitting.focal_length import (
+from ..fitting.camera_fit import (
+    ASPECT,
+    FOCAL_LENGTH,
     USUAL_DEVIATION,
     USUAL_FOCAL,
-    FocalFit,
-    FocalPrior,
-    fit_focal_length,
-    focal_information,
-    moved_away,
+    CameraFit,
+    CameraPrior,
+    Powers,
+    camera_information,
+    fit_camera,
+    kept_in_place,
     scaled_cameras,
 )
+from ..fitting.contour_problem import ContourProblem
+from ..fitting.edges import EdgeCrops
 from ..fitting.least_squares import PointMatches
 from ..fitting.measured_fit import FULL_SIZE_RADII, ContourFit, measured_fit
 from ..fitting.texture_fit import CONVINCING_RATIO, texture_matches
@@ -102,14 +105,14 @@ def best_of_fields(evidence: Tensor, count: int) -> Tensor:
     return started
 
 
-def focal_prior(item: Photograph, cameras: Tensor) -> FocalPrior:
+def focal_prior(item: Photograph, cameras: Tensor) -> CameraPrior:
     """What is known of the focal length of a photograph's camera; ``cameras`` (N, 3, 3) are where
     fits begin."""
     if item.has_estimated_camera:
-        return FocalPrior.usual(cameras, item.size)
+        return CameraPrior.usual(cameras, item.size)
     gap = (item.K[0, 0] / cameras[:, 0, 0]).log()
     reach = 4.0 * item.focal_deviation
-    return FocalPrior(gap, item.focal_deviation, gap - reach, gap + reach)
+    return CameraPrior(gap, item.focal_deviation, gap - reach, gap + reach)
 
 
 def with_focal_length(
@@ -121,23 +124,23 @@ def with_focal_length(
         half = ContourProblem.of(
             describer.contours, crops, poses.cameras, poses.photograph, factor=2
         )
-        coarse = fit_focal_length(half, T, focal_prior(item, poses.cameras), HALF_RADII)
-        poses = replace(poses, cameras=scaled_cameras(poses.cameras, coarse.log_zoom))
+        coarse = fit_camera(half, T, focal_prior(item, poses.cameras), HALF_RADII)
+        poses = replace(poses, cameras=scaled_cameras(poses.cameras, coarse.log_factor))
         T = coarse.state.T
     full = ContourProblem.of(describer.contours, crops, poses.cameras, poses.photograph)
-    fit = fit_focal_length(full, T, focal_prior(item, poses.cameras), FULL_RADII)
+    fit = fit_camera(full, T, focal_prior(item, poses.cameras), FULL_RADII)
     support = fit.problem.edge_support(fit.state)
     measured: ContourFit = measured_fit(fit.problem, fit.state, support, poses.start_support)
-    cameras = scaled_cameras(poses.cameras, fit.log_zoom)
+    cameras = scaled_cameras(poses.cameras, fit.log_factor)
     return replace(poses, cameras=cameras).with_fit(measured, describer.centre)
 
 
 def zoomed(poses: Hypotheses, focal: Tensor, centre: Tensor) -> Hypotheses:
     """Poses whose images keep size and place while their cameras get the focal lengths ``focal``
     (N,) in px."""
-    log_zoom = (focal / poses.cameras[:, 0, 0]).log()
-    moved = placed(poses, moved_away(poses.T, log_zoom, centre), centre)
-    return replace(moved, cameras=scaled_cameras(poses.cameras, log_zoom))
+    log_factor = (focal / poses.cameras[:, 0, 0]).log()
+    moved = placed(poses, kept_in_place(poses.T, log_factor, centre), centre)
+    return replace(moved, cameras=scaled_cameras(poses.cameras, log_factor))
 
 
 def focal_covariance(
@@ -147,7 +150,7 @@ def focal_covariance(
     deviation of that, as a fraction."""
     full = ContourProblem.of(describer.contours, crops, pose.cameras, pose.photograph)
     state = full.state(pose.T)
-    information, motion = focal_information(full, state, FULL_SIZE_RADII[-1])
+    information, motion = camera_information(full, state, FULL_SIZE_RADII[-1])
     measured = REPORTED_VARIANCE * information.variance
     variance = 1.0 / (1.0 / measured + 1.0 / item.focal_deviation**2)
     # From the translation of the centre to that of the origin, as in pose_covariance
@@ -342,6 +345,10 @@ twice the errors where a fit finds the focal length."""
 SMALLEST_GAP = 0.14
 """Difference of log f, 15 % of the distance, up to which a focal length is not named."""
 
+SMALLEST_STRETCH = 0.15
+"""Logarithm of a factor by which a photograph is stretched up to which it is not named. Scans of
+objects look stretched by up to 0.13; a picture of 5:4 that was made square is, by 0.22."""
+
 NOTICED_STEP = 0.02
 """First step of log f from which a focal length is fitted: with the right camera most first steps
 are smaller, and a fit takes ten times as long as a step."""
@@ -363,29 +370,28 @@ def with_checked_cameras(
     results: Sequence[Registration],
 ) -> list[Registration]:
     """Results of photographs, whose ``best`` poses are one in each, with a warning where one is
-    reliable and the photograph contradicts the focal length of its camera."""
+    reliable and the photograph contradicts its camera: it looks stretched, or shows another focal
+    length."""
     found = list(results)
-    checked = torch.tensor(
-        [
-            place
-            for place, (result, item) in enumerate(zip(results, block.photographs, strict=True))
-            if result.reliable and not item.has_estimated_camera
-        ],
-        dtype=torch.long,
-    )
-    if not len(checked):
+    checked = [place for place, result in enumerate(found) if result.reliable]
+    if not checked:
         return found
-    some = best[checked]
-    printed = torch.tensor([block.printed(p) > 0.0 for p in checked.tolist()])
-    gaps, deviations = focal_gaps(target.describer, crops, some, printed)
-    for place, camera, gap, deviation in zip(
-        checked.tolist(), some.cameras, gaps, deviations, strict=True
+    items = [block.photographs[place] for place in checked]
+    gaps, deviations = camera_gaps(
+        target.describer,
+        crops,
+        best[checked],
+        known=torch.tensor([not item.has_estimated_camera for item in items]),
+        printed=torch.tensor([block.printed(place) > 0.0 for place in checked]),
+    )
+    for place, item, gap, deviation in zip(
+        checked, items, gaps.tolist(), deviations.tolist(), strict=True
     ):
-        text = focal_contradiction(
-            float(camera[0, 0]),
-            float(gap),
-            float(deviation),
-            given_deviation=block.photographs[place].focal_deviation,
+        text = stretch_contradiction(gap[0], deviation[0]) or focal_contradiction(
+            float(best.cameras[place, 0, 0]),
+            gap[1],
+            deviation[1],
+            given_deviation=item.focal_deviation,
         )
         if text is not None:
             result = found[place]
@@ -393,42 +399,50 @@ def with_checked_cameras(
     return found
 
 
-def focal_gaps(
-    describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses, printed: Tensor
+def camera_gaps(
+    describer: ViewDescriber,
+    crops: EdgeCrops,
+    poses: Hypotheses,
+    *,
+    known: Tensor,
+    printed: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """How far photographs contradict the focal lengths of fitted poses.
+    """How far photographs contradict the cameras of fitted poses.
 
     Args:
         describer: of the mesh.
         crops: of the photographs.
         poses: N > 0 of them.
+        known: (N,) bool, whether the focal length is given, and compared.
         printed: (N,) bool, whether the photograph shows a print of the mesh, to which the focal
             length is then fitted as well.
 
     Returns:
-        (N,) by how much the log of the focal length that a photograph shows exceeds that of its
-        camera, and (N,) its standard deviation, infinite where nobody looked further, as the first
-        step or a fit at half the size is small, or the photograph does not determine the focal
-        length.
+        (N, 2) by how much the logarithms of fx / fy and of the focal length that a photograph shows
+        exceed those of its camera, and (N, 2) their standard deviations, infinite where nobody
+        looked further, as the first step or a fit at half the size is small, or the photograph does
+        not determine them.
     """
-    gap = torch.zeros(len(poses), dtype=torch.float64)
+    gap = torch.zeros(len(poses), 2, dtype=torch.float64)
     deviation = torch.full_like(gap, torch.inf)
     problem = ContourProblem.of(describer.contours, crops, poses.cameras, poses.photograph)
-    first, _ = focal_information(problem, problem.state(poses.T), FULL_SIZE_RADII[0])
+    first, _ = camera_information(problem, problem.state(poses.T), FULL_SIZE_RADII[0])
     expected = (REPORTED_VARIANCE * first.variance).sqrt()
-    noticed = first.step.abs() > NOTICED_STEP
+    noticed = known & (first.step.abs() > NOTICED_STEP)
     by_contours = noticed & (expected < WITHIN_REACH)
     for row in (noticed & printed).nonzero()[:, 0].tolist():
         one = slice(row, row + 1)
         found = _fitted_to_print(describer, crops, poses[one], problem[one])
         if found is not None:
-            gap[row], deviation[row] = found
+            gap[row, 1], deviation[row, 1] = found
             by_contours[row] = False
-    rows = by_contours.nonzero()[:, 0]
-    if len(rows):
-        found = _fitted_to_contours(describer, crops, poses[rows])
-        gap = gap.index_copy(0, rows, found[0])
-        deviation = deviation.index_copy(0, rows, found[1])
+    every = torch.arange(len(poses))
+    focal = by_contours.nonzero()[:, 0]
+    row = torch.cat([every, focal])
+    column = torch.cat([torch.zeros_like(every), torch.ones_like(focal)])
+    gap[row, column], deviation[row, column] = _fitted_to_contours(
+        describer, crops, poses[row], column
+    )
     return gap, torch.where(deviation < CLEAR_DEVIATION, deviation, torch.inf)
 
 
@@ -442,41 +456,69 @@ def _fitted_to_print(
     matches = texture_matches(describer.draw, describer.renderer, problem, photograph, pose.T)
     if matches is None:
         return None
-    fit = fit_focal_length(problem, pose.T, _no_prior(pose.cameras), FULL_RADII, matches)
+    prior = _no_prior(pose.cameras, FOCAL_LENGTH)
+    fit = fit_camera(problem, pose.T, prior, FULL_RADII, matches)
     ratio = matches.inlier_ratio(fit.state.T, fit.problem.K)
     if ratio < CONVINCING_RATIO:
         return None
-    return fit.log_zoom, _deviation(fit, matches)
+    return fit.log_factor, _deviation(fit, FOCAL_LENGTH, matches)
 
 
 def _fitted_to_contours(
-    describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses
+    describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses, column: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Gaps and deviations, see :func:`focal_gaps`, by contours alone."""
+    """Gaps and deviations (N,), see :func:`camera_gaps`, in this ``column`` (N,), by contours
+    alone."""
+    powers = torch.tensor([ASPECT, FOCAL_LENGTH], dtype=torch.float64)[column]
+    smallest = torch.tensor([SMALLEST_STRETCH, SMALLEST_GAP], dtype=torch.float64)[column]
     half = ContourProblem.of(describer.contours, crops, poses.cameras, poses.photograph, factor=2)
-    coarse = fit_focal_length(half, poses.T, _no_prior(poses.cameras), HALF_RADII)
-    gap = coarse.log_zoom
+    coarse = fit_camera(half, poses.T, _no_prior(poses.cameras, powers), HALF_RADII)
+    gap = coarse.log_factor
     deviation = torch.full_like(gap, torch.inf)
-    far = (gap.abs() > 0.5 * SMALLEST_GAP).nonzero()[:, 0]
+    far = (gap.abs() > 0.5 * smallest).nonzero()[:, 0]
     if not len(far):
         return gap, deviation
     some = poses[far]
-    cameras = scaled_cameras(some.cameras, gap[far])
+    powers = powers[far]
+    cameras = scaled_cameras(some.cameras, gap[far], powers)
     full = ContourProblem.of(describer.contours, crops, cameras, some.photograph)
-    fine = fit_focal_length(full, coarse.state.T[far], _no_prior(cameras), FULL_RADII)
-    gap = gap.index_add(0, far, fine.log_zoom)
-    return gap, deviation.index_copy(0, far, _deviation(fine))
+    fine = fit_camera(full, coarse.state.T[far], _no_prior(cameras, powers), FULL_RADII)
+    gap = gap.index_add(0, far, fine.log_factor)
+    return gap, deviation.index_copy(0, far, _deviation(fine, powers))
 
 
-def _deviation(fit: FocalFit, matches: PointMatches | None = None) -> Tensor:
-    """(N,) standard deviation of log f."""
-    information, _ = focal_information(fit.problem, fit.state, FULL_SIZE_RADII[-1], matches)
+def _deviation(fit: CameraFit, powers: Powers, matches: PointMatches | None = None) -> Tensor:
+    """(N,) standard deviation of the logarithm of an unknown factor."""
+    information, _ = camera_information(
+        fit.problem, fit.state, FULL_SIZE_RADII[-1], matches, powers
+    )
     return (REPORTED_VARIANCE * information.variance).sqrt()
 
 
-def _no_prior(cameras: Tensor) -> FocalPrior:
+def _no_prior(cameras: Tensor, powers: Powers) -> CameraPrior:
     nothing = torch.zeros(len(cameras), dtype=torch.float64)
-    return FocalPrior(nothing, WIDE, nothing - LARGEST_CHANGE, nothing + LARGEST_CHANGE)
+    low = nothing - LARGEST_CHANGE
+    high = nothing + LARGEST_CHANGE
+    return CameraPrior(nothing, WIDE, low, high, powers=powers)
+
+
+def stretch_contradiction(gap: float, deviation: float) -> str | None:
+    """What is wrong with a photograph that looks wider than by its camera, by a factor whose
+    logarithm is ``gap``, with a standard ``deviation``; None if it is not clear.
+
+    Example:
+        >>> stretch_contradiction(0.22, 0.02)[:61]
+        'the photograph looks stretched to 1.25 times its width; give '
+        >>> stretch_contradiction(0.14, 0.02) is None
+        True
+    """
+    if abs(gap) <= max(CONTRADICTION * deviation, SMALLEST_STRETCH):
+        return None
+    side = "width" if gap > 0.0 else "height"
+    return (
+        f"the photograph looks stretched to {math.exp(abs(gap)):.2f} times its {side}; give it as "
+        "it was taken, with its own camera, unless the object has other proportions than the mesh"
+    )
 
 
 def focal_contradiction(

@@ -1,29 +1,23 @@
 """Judgement of fitted poses: their order, their probabilities, and what is questionable.
 
-Doubts about the best pose are settled by what a symmetry of the shape makes of it, by its mirror
-image, and by the poses of other meshes.
+Doubts about the best pose are settled by what a symmetry of the shape makes of it, and by the poses
+of other meshes.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import CurviregError
 from ..evidence import Evidence, EvidenceWeights
-from ..fitting.contour_fit import short_fit
 from ..fitting.details import ContourDetails, compared, contour_details
 from ..fitting.edges import EdgeCrops
-from ..geometry.cameras import transform
 from ..geometry.framing import border_sides, outside_fraction
 from ..geometry.viewpoint import rotation_error
-from ..matching import Ranking
-from ..mesh.mesh import MIRROR
-from ..mesh.reflections import reflection_plane
 from ..mesh.round_axis import RoundAxis
-from .block import Block, Described, evidence_of, fitted_poses, with_evidence
+from .block import Block, fitted_poses, with_evidence
 from .confidence import (
     MAX_MARGIN,
     RIVAL_ANGLE,
@@ -34,15 +28,13 @@ from .confidence import (
     is_calibrated,
     probability_of_any,
     ranking_share,
-    resolution,
     shares,
     undetermined_axes,
 )
-from .hypotheses import Hypotheses, by_contours, hypothesis_of, placed, with_short_fit
+from .hypotheses import Hypotheses, by_contours, hypothesis_of, placed
 from .photograph import Photograph
 from .result import (
     AXIS_TOLERANCE,
-    DETERMINING_KEYPOINTS,
     Axis,
     FailedRegistration,
     Registration,
@@ -392,90 +384,6 @@ def with_siblings(
         is_sibling=torch.ones_like(rivals.is_sibling),
     )
     return poses, rivals[block.keeps(rivals)], [is_hidden for _, is_hidden in pairs]
-
-
-LEAST_CONFIDENCE = 0.5  # from which an answer is compared
-MIRROR_DOUBT = 0.3  # factor of the confidence where the mirror image fits better
-MIRROR_WARNING = (
-    "the mirror image of the mesh fits better than the mesh: check whether an axis of it is flipped"
-)
-
-
-def compared_with_mirror_image(
-    target: Target,
-    block: Block,
-    crops: EdgeCrops,
-    best: Hypotheses,
-    results: Sequence[Registration],
-) -> list[Registration]:
-    """Results of photographs, whose ``best`` poses are one in each. Where it is probably right and
-    the mirror image of the mesh fits better, the result gets a warning, and ``MIRROR_DOUBT`` of its
-    confidence."""
-    likely = torch.tensor([(result.confidence or 0.0) >= LEAST_CONFIDENCE for result in results])
-    # a print that is found is not mirrored
-    compared = (likely & (best.evidence.keypoints < DETERMINING_KEYPOINTS)).nonzero()[:, 0]
-    found = list(results)
-    if not len(compared):
-        return found
-    gain = mirror_gain(target, block, crops, best[compared])
-    for place in compared[gain > resolution()].tolist():
-        doubted = found[place].scaled(MIRROR_DOUBT)
-        found[place] = replace(doubted, warnings=(*doubted.warnings, MIRROR_WARNING))
-    return found
-
-
-def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses) -> Tensor:
-    """(N,) by how much the mirror image of the mesh scores more in a photograph than the mesh at
-    its ``best`` pose, by shape alone and after a short fit; minus infinity where it has less edge
-    support, and for a mesh that is its own mirror image."""
-    gain = torch.full((len(best),), -torch.inf, dtype=torch.float64)
-    plane = reflection_plane(target.bank.mesh)
-    if plane is None:
-        return gain
-    image = target.mirror_image
-    centre = image.describer.centre
-    starts = [
-        reflected_poses(one, plane, target.describer.centre, centre)
-        for one in (best[row] for row in torch.arange(len(best)).split(1))
-    ]
-    fitted, support = with_short_fit(image.describer, crops, Hypotheses.cat(starts))
-    _, own = by_contours(short_fit, target.describer, crops, best, radii=())
-    highest = support.view(len(best), -1).amax(dim=1)
-    # Of 28 answers to mirrored meshes, all that the mirror image makes doubtful had 1.08 times as
-    # much and more.
-    rows = (highest >= own).nonzero()[:, 0]
-    if not len(rows):
-        return gain
-    fitted = fitted[torch.isin(fitted.photograph, best.photograph[rows])]
-    described = Described(
-        query=block.query,
-        rankings=[Ranking.none()] * len(block),
-        descriptor=block.descriptor,
-        crops=crops,
-        keypoints=[None] * len(block),
-        frames=block.frames,
-    )
-    seen = evidence_of(image, described, placed(fitted, fitted.short_fit, centre))
-    weights = target.score_weights(exact=True)
-    of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
-    score = seen.scores(of_shape).view(len(rows), -1).amax(dim=1)
-    return gain.index_copy(0, rows, score - best[rows].evidence.scores(of_shape))
-
-
-def reflected_poses(
-    pose: Hypotheses, plane: Tensor, centre: Tensor, image_centre: Tensor
-) -> Hypotheses:
-    """Two poses at which the mirror image of a mesh is the mesh at one ``pose``, reflected through
-    planes in its ``centre`` (3,): one that faces the camera, and that with the normal ``plane``
-    (3,) in the model's frame. ``image_centre`` (3,) is the centre of the image."""
-    T = pose.T[0]
-    rotation = T[:3, :3]
-    position = rotation @ centre.to(T) + T[:3, 3]
-    normals = torch.stack([F.normalize(position, dim=0), rotation @ plane.to(T)])
-    reflections = torch.eye(3).to(T) - 2.0 * normals[:, :, None] * normals[:, None]
-    R = reflections @ rotation @ MIRROR.to(T)
-    copies = pose[torch.zeros(len(R), dtype=torch.long)]
-    return placed(copies, transform(R, position - R @ image_centre.to(T)), image_centre)
 
 
 DETAILED = 5.0

@@ -49,7 +49,8 @@ from .hypotheses import (
     with_edge_support,
     with_short_fit,
 )
-from .judging import best_of_meshes, compared_with_mirror_image, judged, with_siblings
+from .judging import best_of_meshes, judged, with_siblings
+from .mirror_image import MIRROR_WARNING, compared_with_mirror_image
 from .photograph import Photograph, check_crop
 from .result import FailedRegistration, Registration, Results
 from .target import Target
@@ -135,7 +136,8 @@ def _with_best_corrected(
     of_meshes: Sequence[Results], best: Results, meshes: Sequence[Target], items: Items
 ) -> list[Results]:
     """The results of several meshes, in corrected boxes where a mesh is the best one of a
-    photograph: with wrong meshes nearly all answers are doubtful."""
+    photograph: with wrong meshes nearly all answers are doubtful. Another box does not make a
+    mirrored mesh the right one."""
     corrected = []
     for number, (mesh, results) in enumerate(zip(meshes, of_meshes, strict=True)):
         chosen = {
@@ -144,6 +146,7 @@ def _with_best_corrected(
             if isinstance(result, Registration)
             and isinstance(one, Registration)
             and one.mesh_index == number
+            and MIRROR_WARNING not in result.warnings
         }
         again = _in_corrected_boxes(mesh, items, chosen)
         corrected.append([again.get(k, result) for k, result in enumerate(results)])
@@ -311,7 +314,7 @@ def register(
     if block.crops is None or not block.exact:
         return results
     best = compared[compared.best(target.score_weights(exact=True))]
-    results = compared_with_mirror_image(target, block, block.crops, best, results)
+    results = compared_with_mirror_image(target, block, best, results)
     return with_checked_cameras(target, block, block.crops, best, results)
 
 

@@ -18,7 +18,6 @@ from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber, ViewMatcher
 from ..matching.detector import Detector
 from ..mesh import Mesh, mesh_radius, mesh_symmetries
-from ..mesh.mesh import mirrored
 from ..mesh.round_axis import RoundAxis, round_axis
 from ..mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from ..terms import QueryFeatures
@@ -224,21 +223,6 @@ class Target:
         return self.matcher.describer.with_settings(
             replace(settings, grid=min(2 * settings.grid, settings.image_size))
         )
-
-    @property
-    def mirror_image(self) -> "Target":
-        """The target of the mesh's mirror image, without colours."""
-        with _SHAPE_LOCK:  # photographs share it
-            return self._mirror_image
-
-    @cached_property
-    def _mirror_image(self) -> "Target":
-        known = self.describer
-        mesh = Mesh(mirrored(known.view_mesh))
-        describer = ViewDescriber(mesh, known.settings, device=self.bank.device)
-        image = copy(self)
-        image.describer = describer
-        return image
 
     @cached_property
     def detector(self) -> Detector:

@@ -19,7 +19,7 @@ from curvireg_torch.matching import bank as bank_module
 from curvireg_torch.matching.describe import view_mesh
 from curvireg_torch.mesh import MeshWarning, mesh_symmetries, reflections, symmetry
 from curvireg_torch.mesh.mesh import extreme_points
-from curvireg_torch.mesh.reflections import reflection_plane
+from curvireg_torch.mesh.reflections import is_its_own_mirror_image
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Correlation
@@ -104,7 +104,7 @@ def test_a_file_keeps_what_is_known_of_the_mesh(small_bank, tmp_path):
     bank.save(tmp_path / "bank.safetensors")
     loaded = ViewBank.load(tmp_path / "bank.safetensors").mesh
     assert {name: getattr(loaded, name) for name in known} == known
-    assert {"extreme_points", "mesh_symmetries", "reflection_plane"} <= set(loaded.measures)
+    assert {"extreme_points", "mesh_symmetries", "is_its_own_mirror_image"} <= set(loaded.measures)
 
 
 def test_save_and_load(small_bank, tmp_path):
@@ -190,9 +190,6 @@ def with_nan(x):
         ("extreme_points", lambda x: x.float(), "extreme_points: expected float64"),
         ("extreme_points", lambda x: x[:, 1:], "extreme_points: expected shape"),
         ("mesh_symmetries", lambda x: 2 * x, "symmetries: expected"),
-        ("reflection_plane", lambda x: x.new_ones(1, 3), "reflection_plane: .* unit"),
-        ("reflection_plane", lambda x: x.new_ones(1, 3).float(), "reflection_plane: .* float64"),
-        ("reflection_plane", lambda x: x[:, :2], "reflection_plane: expected shape"),
     ],
 )
 def test_load_refuses_contents_that_no_bank_has(saved, name, by, message):
@@ -202,17 +199,14 @@ def test_load_refuses_contents_that_no_bank_has(saved, name, by, message):
 
 
 @pytest.mark.parametrize("is_lopsided", [False, True])
-def test_load_restores_the_plane_of_reflection(is_lopsided, tmp_path, monkeypatch):
+def test_load_restores_whether_a_mesh_is_its_own_mirror_image(is_lopsided, tmp_path, monkeypatch):
     mesh = trimesh.creation.box((1.0, 2.0, 3.0))
     if is_lopsided:
         lump = trimesh.creation.box((0.5, 0.6, 0.7)).apply_translation((0.7, 0.6, 0.5))
         mesh = trimesh.util.concatenate([mesh, lump])
     build(mesh, TWO).save(path := tmp_path / "bank")
-    plane = reflection_plane(mesh)
     monkeypatch.setattr(reflections, "cKDTree", None)  # would fail
-    loaded = reflection_plane(ViewBank.load(path).mesh)
-    assert (plane is None) is not is_lopsided
-    assert loaded is None if plane is None else torch.equal(loaded, plane)
+    assert is_its_own_mirror_image(ViewBank.load(path).mesh) is not is_lopsided
 
 
 def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):

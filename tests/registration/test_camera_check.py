@@ -1,18 +1,20 @@
-"""Focal lengths that a photograph contradicts."""
+"""Cameras that a photograph contradicts."""
 
 import math
+import re
 from functools import cache
 from unittest.mock import Mock
 
 import pytest
 import torch
+from kornia.geometry.transform import resize
 
 from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.least_squares import PointMatches, pixels
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.block import Block
-from curvireg_torch.registration.camera import focal_contradiction
+from curvireg_torch.registration.camera import focal_contradiction, stretch_contradiction
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support import learned_registrar, seeded, seen_from
@@ -35,11 +37,27 @@ def near_photograph():
 
 @cache
 def registered(factor):
-    """The result of a camera that is wrong by a factor, and what was given to measure that."""
+    """The result of a camera that is wrong by a factor, and its describer, crops and pose."""
     image, box = near_photograph()
     with pytest.MonkeyPatch.context() as patch:
-        given = spied(patch, camera_module, "focal_gaps")
+        given = spied(patch, camera_module, "camera_gaps")
         return learned_registrar()([image], box[None], camera(factor))[0], given[0]
+
+
+def together(*factors):
+    """Describer and crops of several cameras, and their poses in one."""
+    given = [registered(factor)[1] for factor in factors]
+    describer, crops, _ = given[0]
+    return describer, crops, Hypotheses.cat([pose for _, _, pose in given])
+
+
+def focal_gaps(describer, crops, poses, *, known=True, printed=False):
+    """Gaps and deviations of focal lengths, (N,) each."""
+    every = torch.ones(len(poses), dtype=torch.bool)
+    found = camera_module.camera_gaps(
+        describer, crops, poses, known=every & known, printed=every & printed
+    )
+    return [column[:, 1] for column in found]
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.3])
@@ -56,52 +74,84 @@ def test_a_focal_length_that_the_photograph_contradicts_is_named_and_not_reliabl
     assert shown == pytest.approx(FOCAL, rel=0.05)
 
 
-def together(*factors):
-    """What was given for each of several cameras, in one."""
-    given = [registered(factor)[1] for factor in factors]
-    describer, crops, _, _ = given[0]
-    poses, printed = zip(*(one[2:] for one in given), strict=True)
-    return describer, crops, Hypotheses.cat(poses), torch.cat(printed)
+@cache
+def stretched(wide, high, *, with_camera=True):
+    """The result of a photograph of which both sides are longer by factors, and the camera's focal
+    length is not."""
+    image, box = near_photograph()
+    H, W = (round(high * SIZE[0]), round(wide * SIZE[1]))
+    picture = resize(image, (H, W), interpolation="bilinear", align_corners=False)
+    box = box * torch.tensor([wide, high, wide, high])
+    K = camera_matrix(FOCAL, FOCAL, 0.5 * (W - 1), 0.5 * (H - 1), dtype=torch.float64)
+    return learned_registrar()([picture], box[None], K if with_camera else None)[0]
+
+
+@pytest.mark.parametrize(
+    ("wide", "high", "text"),
+    [
+        (1.25, 1.0, "stretched to 1.2. times its width"),
+        (1.0, 1.25, "stretched to 1.2. times its height"),
+    ],
+)
+@pytest.mark.parametrize("with_camera", [True, False])
+def test_a_stretched_photograph_is_named_and_not_reliable(wide, high, text, with_camera):
+    result = stretched(wide, high, with_camera=with_camera)
+    assert result.confidence > 0.9
+    assert not result.reliable
+    assert re.search(text, result.warnings[-1])
+
+
+def test_stretched_photographs_need_two_deviations_and_more_than_scans_are_off():
+    assert stretch_contradiction(0.21, 0.1)
+    assert stretch_contradiction(-0.21, 0.1)
+    assert stretch_contradiction(0.19, 0.1) is None
+    assert stretch_contradiction(0.16, 0.01)
+    assert stretch_contradiction(0.14, 0.01) is None
+    assert stretch_contradiction(0.9, math.inf) is None
+    assert "to 1.49 times its height" in str(stretch_contradiction(-0.4, 0.01))
 
 
 def test_focal_lengths_of_several_photographs_are_compared_at_once(monkeypatch):
     factors = (0.7, 1.0, 1.3)
-    gaps, deviations = camera_module.focal_gaps(*together(*factors))
-    alone = [float(camera_module.focal_gaps(*registered(factor)[1])[0]) for factor in factors]
+    gaps, deviations = focal_gaps(*together(*factors))
+    alone = [float(focal_gaps(*registered(factor)[1])[0]) for factor in factors]
     assert gaps.tolist() == pytest.approx(alone, abs=1e-5)
     assert gaps.tolist() == pytest.approx([0.357, 0.0, -0.262], abs=0.04)
     assert deviations[1] == torch.inf, "the first step is small: nobody looked further"
     assert float(deviations[0]) < 0.15
     monkeypatch.setattr(camera_module, "CLEAR_DEVIATION", float(deviations.min()))
-    strict = camera_module.focal_gaps(*together(*factors))[1]
+    strict = focal_gaps(*together(*factors))[1]
     assert strict.isinf().all(), "as clear as that, none is determined"
 
 
+def test_focal_lengths_that_are_not_known_are_not_compared():
+    gaps, deviations = focal_gaps(*registered(0.7)[1], known=False)
+    assert gaps.tolist() == [0.0]
+    assert deviations.isinf().all()
+
+
 def test_the_print_of_each_photograph_is_compared_with_its_own_pose(monkeypatch):
-    describer, crops, poses, _ = together(1.0, 0.7, 1.3)
+    describer, crops, poses = together(1.0, 0.7, 1.3)
 
     def missing(_, __, pose, problem):
         assert torch.equal(problem.K[0], (crops.transforms[0] @ pose.cameras[0]))
         return (FOCAL / pose.cameras[:, 0, 0]).log(), torch.tensor([0.01])
 
     monkeypatch.setattr(camera_module, "_fitted_to_print", missing)
-    gaps, _ = camera_module.focal_gaps(describer, crops, poses, torch.tensor([True] * 3))
+    gaps, _ = focal_gaps(describer, crops, poses, printed=True)
     assert gaps.tolist() == pytest.approx([0.0, -math.log(0.7), -math.log(1.3)])
 
 
 def compared_by_print(monkeypatch, factor, matches):
     """Gap and deviation of :func:`registered` where matches, made by a function of the pixels at
     which the photograph shows points of the mesh, are found in it; and those by contours alone."""
-    describer, crops, pose, _ = registered(factor)[1]
+    describer, crops, pose = registered(factor)[1]
     truth = seen_from(example_mesh(), 40.0, 25.0, radii=2.6)[None]
     seen = ContourProblem.of(describer.contours, crops, camera(1.0)[None])
     model = seen.state(truth).points.model[:, ::20]
     uv = pixels(model, truth, seen.K)
     monkeypatch.setattr(camera_module, "texture_matches", lambda *_: matches(model, uv))
-    found = [
-        camera_module.focal_gaps(describer, crops, pose, torch.tensor([printed]))
-        for printed in (True, False)
-    ]
+    found = [focal_gaps(describer, crops, pose, printed=printed) for printed in (True, False)]
     return [(float(gap), float(deviation)) for gap, deviation in found]
 
 
@@ -135,13 +185,14 @@ def test_a_print_that_is_not_found_is_no_evidence(monkeypatch, matches):
 @pytest.mark.parametrize("keypoints", [0.0, 0.1])
 def test_prints_are_those_of_photographs_in_which_keypoints_count(monkeypatch, keypoints):
     image, box = near_photograph()
-    nothing = torch.zeros(1)
+    nothing = torch.zeros(1, 2)
     measure = Mock(return_value=(nothing, nothing))
     monkeypatch.setattr(Block, "printed", lambda *_: keypoints)
-    monkeypatch.setattr(camera_module, "focal_gaps", measure)
+    monkeypatch.setattr(camera_module, "camera_gaps", measure)
     learned_registrar()([image], box[None], camera(1.0))
-    *_, printed = measure.call_args.args
-    assert printed.tolist() == [keypoints > 0.0]
+    options = measure.call_args.kwargs
+    assert options["printed"].tolist() == [keypoints > 0.0]
+    assert options["known"].tolist() == [True]
 
 
 def test_contradictions_need_a_clear_focal_length_two_deviations_and_a_distance_that_matters():

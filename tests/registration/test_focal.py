@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from curvireg_torch import camera_matrix
-from curvireg_torch.fitting import focal_length
+from curvireg_torch.fitting import camera_fit
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.geometry import Camera, axis_angle_from_rotation
 from curvireg_torch.geometry.cameras import point_in_cameras, project_points, rotation_towards
@@ -26,7 +26,7 @@ from tests._support import (
     truck_registrar,
 )
 from tests._support.hypotheses import placed_at
-from tests.fitting.test_focal_length import NEAR, near_scene
+from tests.fitting.test_camera_fit import NEAR, near_scene
 
 
 def test_covariance_and_deviation_of_the_focal_length():
@@ -105,16 +105,16 @@ def test_zoomed_poses_keep_their_images():
 def test_priors_by_source():
     image, box, _ = near_scene()
     item = as_photograph(image, box, NEAR)
-    cameras = focal_length.scaled_cameras(NEAR[None], double([0.1]))
+    cameras = camera_fit.scaled_cameras(NEAR[None], double([0.1]))
     exif = camera_module.focal_prior(item.by(NEAR, focal_deviation=0.05, source="exif"), cameras)
-    found = [float(zoom) for zoom in (exif.low, exif.log_zoom, exif.high)]
+    found = [float(zoom) for zoom in (exif.low, exif.log_factor, exif.high)]
     assert found == pytest.approx([-0.3, -0.1, 0.1])
     assert (exif.deviation, exif.reach) == (0.05, float("inf"))
     usual = camera_module.focal_prior(item.by(NEAR, source="estimated"), NEAR[None])
-    least, most = focal_length.FOCAL_LIMITS
-    zooms = (usual.low, usual.log_zoom, usual.high)
+    least, most = camera_fit.FOCAL_LIMITS
+    zooms = (usual.low, usual.log_factor, usual.high)
     found = [150.0 / max(SIZE) * float(zoom.exp()) for zoom in zooms]
-    assert found == pytest.approx([least, focal_length.USUAL_FOCAL, most])
+    assert found == pytest.approx([least, camera_fit.USUAL_FOCAL, most])
 
 
 def test_an_unknown_principal_point_moves_the_object_with_its_ray_and_keeps_its_look():

@@ -1,22 +1,26 @@
 """The mirror image of a mesh beside the mesh."""
 
+import numpy as np
 import pytest
 import torch
 import trimesh
 
-from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
-from curvireg_torch.registration import judging
+from curvireg_torch.geometry.cameras import projected
+from curvireg_torch.registration import mirror_image, stages
+from curvireg_torch.registration.photograph import as_photograph
 from tests._support import (
     CAMERA,
+    SIZE,
+    answer_of,
     answer_to,
     bank_around,
     double,
     exact_registrar,
+    eye,
     learned_registrar,
     scene,
 )
-from tests._support.hypotheses import placed_at
-from tests._support.poses import poses as random_poses
+from tests._support.spies import spied
 
 
 def chiral_mesh():
@@ -28,60 +32,72 @@ def chiral_mesh():
     return trimesh.util.concatenate(parts)
 
 
-def test_mirrored_mesh_is_inside_out_nowhere():
-    mesh = chiral_mesh()
-    image = mirrored(mesh)
-    assert image.volume == pytest.approx(mesh.volume)
-    assert image.bounds[0, 0] == -mesh.bounds[1, 0]
+def mirrored(surface):
+    """The mirror image of a surface, with its faces turned."""
+    return surface.copy().apply_transform(np.diag([-1.0, 1.0, 1.0, 1.0]))
 
 
-def test_reflected_poses_show_the_mesh_reflected():
-    mesh = chiral_mesh()
-    T = random_poses(1, seed=4)
-    rotation = T[0, :3, :3]
-    plane = double([0.0, 0.6, 0.8])
-    centres = mesh_centre(mesh), mesh_centre(mirrored(mesh))
-    found = judging.reflected_poses(placed_at(T, centres[0]), plane, *centres).T
-    vertices = torch.from_numpy(mesh.vertices.copy())
-    seen = vertices @ rotation.T + T[0, :3, 3]
-    position = rotation @ mesh_centre(mesh) + T[0, :3, 3]
-    normals = torch.nn.functional.normalize(position, dim=0), rotation @ plane
-    for T_image, normal in zip(found, normals, strict=True):
-        away = (seen - position) @ normal
-        expected = seen - 2.0 * away[:, None] * normal
-        image = (vertices @ MIRROR) @ T_image[:3, :3].T + T_image[:3, 3]
-        torch.testing.assert_close(image, expected)
-        assert torch.linalg.det(T_image[:3, :3]) == pytest.approx(1.0)
+def test_a_mirror_shows_the_mirror_image_of_a_mesh():
+    """Points of the mesh project onto the flipped photograph where those of the image are."""
+    item = as_photograph(*scene(0)[:2], None, mask=torch.rand(SIZE))
+    K = double([[200.0, 0.0, 100.0], [0.0, 210.0, 80.0], [0.0, 0.0, 1.0]])
+    seen = mirror_image.flipped(item, K)
+    points = torch.rand(5, 3, dtype=torch.float64) + double([-0.5, -0.5, 2.0])
+    uv = projected(points, eye(4)[None], K[None])[0]
+    in_mirror = projected(
+        points * double([-1.0, 1.0, 1.0]), torch.eye(4).double()[None], seen.K[None]
+    )[0]
+    last = SIZE[1] - 1
+    torch.testing.assert_close(in_mirror[:, 0], last - uv[:, 0])
+    torch.testing.assert_close(in_mirror[:, 1], uv[:, 1])
+    assert torch.equal(seen.image[..., 7], item.image[..., last - 7])
+    assert torch.equal(seen.mask[..., 7], item.mask[..., last - 7])
+    x0, y0, x1, y1 = item.box.tolist()
+    assert seen.box.tolist() == pytest.approx([last - x1, y0, last - x0, y1])
+    again = mirror_image.flipped(seen, seen.K)
+    assert torch.equal(again.image, item.image)
+    assert torch.equal(again.K, K)
 
 
 def test_confidence_falls_where_the_mirror_image_fits_better(monkeypatch):
     for gain, is_doubted in ((-1.0, False), (0.4, False), (1.5, True)):
-        monkeypatch.setattr(judging, "mirror_gain", lambda *_, gain=gain: torch.tensor([gain]))
+        monkeypatch.setattr(mirror_image, "mirror_gain", lambda *_, gain=gain: double([gain]))
         result = answer_to(0, learned_registrar())
-        assert (judging.MIRROR_WARNING in result.warnings) == is_doubted
+        assert (mirror_image.MIRROR_WARNING in result.warnings) == is_doubted
         assert result.reliable != is_doubted
         if is_doubted:
             assert result.confidence < 0.5
 
 
+@pytest.mark.parametrize(("gain", "boxes"), [(-1.0, 2), (1.5, 1)])
+def test_a_mirrored_mesh_is_not_sought_in_other_boxes(gain, boxes, monkeypatch):
+    """In which the flipped photograph may be seen in a wrong one."""
+    monkeypatch.setattr(mirror_image, "mirror_gain", lambda *_: double([gain]))
+    registered = spied(monkeypatch, stages, "register_boxes")
+    image, box, _ = scene(0)
+    answer_of(learned_registrar(), image, box + double([0.0, 0.0, 12.0, 12.0]))
+    assert sum(len(items) for _, items in registered) == boxes
+
+
 def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
     gains = []
-    measure = judging.mirror_gain
+    measure = mirror_image.mirror_gain
 
     def recorded(*given):
         gain = measure(*given)
         gains.extend(gain.tolist())
         return gain
 
-    monkeypatch.setattr(judging, "mirror_gain", recorded)
+    monkeypatch.setattr(mirror_image, "mirror_gain", recorded)
     assert answer_to(0, learned_registrar()).reliable
-    assert gains == [-torch.inf], "the mirror image has less edge support"
-    bank = bank_around(mirrored(learned_registrar().bank.mesh), 30, [0, 30, 60])
-    monkeypatch.setattr(judging, "LEAST_CONFIDENCE", 0.0)
+    assert gains.pop() < -1.0
+    bank = bank_around(mirrored(learned_registrar().bank.mesh.surface), 30, [0, 30, 60])
+    monkeypatch.setattr(mirror_image, "LEAST_CONFIDENCE", 0.0)
     image, box, _ = scene(0)
     last = image.shape[-1] - 1
     x0, y0, x1, y1 = box.tolist()
     boxes = torch.tensor([[x0, y0, x1, y1], [last - x1, y0, last - x0, y1]])
     both = exact_registrar(bank)([image, image.flip(-1)], boxes, CAMERA)
-    assert [judging.MIRROR_WARNING in result.warnings for result in both] == [True, False]
-    assert gains[1] > 0.0 > gains[2]
+    assert [mirror_image.MIRROR_WARNING in result.warnings for result in both] == [True, False]
+    assert gains[0] > 1.0
+    assert gains[1] < -1.0

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from curvireg_torch.fitting.focal_length import USUAL_FOCAL, FocalInformation, scaled_cameras
+from curvireg_torch.fitting.camera_fit import USUAL_FOCAL, CameraInformation, scaled_cameras
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import Camera
 from curvireg_torch.geometry.cameras import point_in_cameras
@@ -77,13 +77,13 @@ def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source
         T = T.clone()
         T[0, 0, 3] += 1.0
         state = SimpleNamespace(T=T)
-        return SimpleNamespace(problem=problem, state=state, log_zoom=double([0.1]))
+        return SimpleNamespace(problem=problem, state=state, log_factor=double([0.1]))
 
     def measured(_, state, support, __):
         return replace(poses.fit, transform=state.T, edge_support=support.double())
 
     monkeypatch.setattr(camera_module.ContourProblem, "of", problem)
-    monkeypatch.setattr(camera_module, "fit_focal_length", fit)
+    monkeypatch.setattr(camera_module, "fit_camera", fit)
     monkeypatch.setattr(camera_module, "measured_fit", measured)
     describer = SimpleNamespace(contours=None, centre=CENTRE)
     camera = Camera(CAMERA, focal_deviation=0.1, source=source)
@@ -100,10 +100,10 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
     pose = replace(poses_of(1), covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
     motion = double([[0.02, -0.03, 0.01, 0.3, -0.1, 0.5]])
     one = double([1.0])
-    information = FocalInformation(amount=one, scale=0.04 * one, step=one)
+    information = CameraInformation(amount=one, scale=0.04 * one, step=one)
     problem = SimpleNamespace(state=lambda _: None)
     monkeypatch.setattr(camera_module.ContourProblem, "of", lambda *_: problem)
-    monkeypatch.setattr(camera_module, "focal_information", lambda *_: (information, motion))
+    monkeypatch.setattr(camera_module, "camera_information", lambda *_: (information, motion))
     describer = SimpleNamespace(contours=None, centre=CENTRE)
     item = photographed(Camera(CAMERA, focal_deviation=0.2))
     covariance, deviation = camera_module.focal_covariance(describer, NOTHING, pose, item)
