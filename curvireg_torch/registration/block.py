@@ -205,9 +205,10 @@ def described(
     rankings: Sequence[Ranking],
     *,
     contours: bool,
+    keypoints: bool = True,
 ) -> Described:
     """Photographs in their boxes, which the matcher has described as ``query`` and ranked; with
-    crops for ``contours``."""
+    crops for ``contours``, and ``keypoints``."""
     crops = None
     if contours:
         mask = target.object_mask(query, photographs)
@@ -223,7 +224,7 @@ def described(
         descriptor=target.describer.descriptor(torch.stack(fields)),
         crops=crops,
         keypoints=[
-            target.keypoint_matches(item, item.box) if target.uses_keypoints else None
+            target.keypoint_matches(item, item.box) if keypoints and target.uses_keypoints else None
             for item in photographs
         ],
         frames=frames,
