@@ -223,7 +223,7 @@ class ViewDescriber:
         1), its centre on the axis; orthographic in model units."""
         # An orthographic camera does not see the distance.
         seen = torch.ones_like(distances) if self._orthographic else distances
-        source, quarters = quarter_turns(rotations, seen)
+        source, quarters = _quarter_turns(rotations, seen)
         rendered = source == torch.arange(len(source))
         T, K, boxes = self.cameras(rotations[rendered], distances[rendered])
         boxes = boxes.to(self._device)
@@ -253,7 +253,7 @@ class ViewDescriber:
         }
 
 
-def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
+def _quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
     """Group views that are the same picture rotated in the plane by a multiple of 90 degrees.
     Returns, on the CPU, the index (N,) of the first view of each view's group, and the number (N,)
     of clockwise 90 degree rotations, 0 to 3, from that view to this one."""
