@@ -253,29 +253,9 @@ class ViewMatcher(nn.Module):
     ) -> QueryFeatures:
         """Field, descriptors and points of (B, C, S, S) crops; ``shapes`` (B,) of the boxes.
         ``box_jitter`` is by default the pipeline's."""
-        field, mask = photograph_field(self.field, crops)
-        jitter = self.pipeline.box_jitter if box_jitter is None else box_jitter
-        return self._described(crops, field, mask, shapes, jitter)
-
-    @full_precision()
-    def flipped(self, query: QueryFeatures, index: Tensor) -> QueryFeatures:
-        """Some of the described photographs (P,) as a mirror shows them; their fields are flipped,
-        not computed again."""
-        mirrored = query.field.new_tensor([-1.0, 1.0]).view(2, 1, 1) * query.field[index]
-        mask = None if query.mask is None else query.mask[index].flip(-1)
-        return self._described(
-            query.crops[index].flip(-1),
-            mirrored.flip(-1),
-            mask,
-            query.shapes[index],
-            self.pipeline.box_jitter,
-        )
-
-    def _described(
-        self, crops: Tensor, field: Tensor, mask: Tensor | None, shapes: Tensor, jitter: float
-    ) -> QueryFeatures:
-        """Descriptors and points of crops with their field and mask."""
         settings = self.bank.settings
+        jitter = self.pipeline.box_jitter if box_jitter is None else box_jitter
+        field, mask = photograph_field(self.field, crops)
         jittered = jittered_fields(field, jitter, settings.margin)
         B, K = jittered.shape[:2]
         fields = jittered.flatten(0, 1)
@@ -314,10 +294,25 @@ class ViewMatcher(nn.Module):
         return Ranking(log.exp(), order, {**terms, **compared}, allowed, outside)
 
     @full_precision()
-    def rank_shapes(self, query: QueryFeatures) -> Ranking:
-        """:meth:`rank` without the appearance term, at a fraction of the cost."""
-        terms, log = self._first_terms(query)
-        return Ranking(log.exp(), log.argsort(dim=1, descending=True, stable=True), terms)
+    def flipped(self, query: QueryFeatures, index: Tensor) -> tuple[QueryFeatures, Ranking]:
+        """Some of the described photographs (P,) as a mirror shows them, without points, and their
+        ranking by descriptors alone. Their fields are flipped, not computed again."""
+        settings = self.bank.settings
+        mirrored = query.field.new_tensor([-1.0, 1.0]).view(2, 1, 1) * query.field[index]
+        field = mirrored.flip(-1)
+        jittered = jittered_fields(field, self.pipeline.box_jitter, settings.margin)
+        flipped = QueryFeatures(
+            crops=query.crops[index].flip(-1),
+            field=field,
+            descriptors=self.descriptor(jittered.flatten(0, 1)).unflatten(0, jittered.shape[:2]),
+            points=query.points[:0],
+            shapes=query.shapes[index],
+            mask=None if query.mask is None else query.mask[index].flip(-1),
+        )
+        by_name = {term.name: compare for term, compare in self._terms}
+        scores = by_name[Correlation.name](flipped)
+        order = scores.argsort(dim=1, descending=True, stable=True)
+        return flipped, Ranking(scores, order, {Correlation.name: scores})
 
     @full_precision()
     def similarity(self, query: QueryFeatures, allowed: Tensor | None = None) -> Tensor:

@@ -11,12 +11,15 @@ import torch
 from torch import Tensor
 
 from ..evidence import EvidenceWeights
+from ..fitting.contour_fit import short_fit
+from ..fitting.edges import EdgeCrops
 from ..matching import Ranking
 from ..mesh.reflections import is_its_own_mirror_image
 from ..terms import QueryFeatures
+from ..utils.segments import best_within
 from .block import Block, described, fitted_poses, poses_of_views, with_evidence
 from .confidence import resolution
-from .hypotheses import Hypotheses, best_views, placed, with_short_fit
+from .hypotheses import Hypotheses, best_views, by_contours, placed, with_short_fit
 from .photograph import Photograph
 from .result import DETERMINING_KEYPOINTS, Registration
 from .target import Target
@@ -30,19 +33,16 @@ MIRROR_WARNING = (
 LESS_ALIKE = 0.015
 """By how much less alike than in the photograph a view may be in the flipped one for the mirror
 image to come into question: 0.012 in generated photographs of mirrored meshes in which it fits
-better."""
+better. There it also has as much edge support after a short fit."""
 
 TRIED_VIEWS = 4
 """Best distinct views in a flipped photograph, which get a short fit."""
-
-PROMISING = 1.5
-"""Score by which the mirror image may be behind the fitted mesh after a short fit to be fitted as
-well, by which it gained 0 to 3.7 in 21 generated photographs of mirrored meshes."""
 
 
 def compared_with_mirror_image(
     target: Target,
     block: Block,
+    crops: EdgeCrops,
     best: Hypotheses,
     results: Sequence[Registration],
 ) -> list[Registration]:
@@ -55,19 +55,20 @@ def compared_with_mirror_image(
     compared = (likely & (best.evidence.keypoints < DETERMINING_KEYPOINTS)).nonzero()[:, 0]
     if not len(compared) or is_its_own_mirror_image(target.bank.mesh):
         return found
-    gain = mirror_gain(target, block, best[compared])
+    gain = mirror_gain(target, block, crops, best[compared])
     for place in compared[gain > resolution()].tolist():
         doubted = found[place].scaled(MIRROR_DOUBT)
         found[place] = replace(doubted, warnings=(*doubted.warnings, MIRROR_WARNING))
     return found
 
 
-def mirror_gain(target: Target, block: Block, best: Hypotheses) -> Tensor:
+def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses) -> Tensor:
     """(N,) by how much the mirror image of the mesh scores more in a photograph than the mesh at
-    its ``best`` pose, by shape alone; minus infinity where no view is as much alike."""
+    its ``best`` pose, by shape alone; minus infinity where no view of it is as much alike, or has
+    as much edge support after a short fit."""
     highest = torch.full((len(best),), -torch.inf, dtype=torch.float64)
-    query = target.matcher.flipped(block.query, best.photograph)
-    rankings = target.matcher.rank_shapes(query).split()
+    query, ranking = target.matcher.flipped(block.query, best.photograph)
+    rankings = ranking.split()
     alike = [
         row
         for row, (p, ranking) in enumerate(zip(best.photograph.tolist(), rankings, strict=True))
@@ -75,24 +76,21 @@ def mirror_gain(target: Target, block: Block, best: Hypotheses) -> Tensor:
     ]
     if not alike:
         return highest
-    seen = _in_a_mirror(target, block, best, query, rankings)
-    crops = seen.crops
-    assert crops is not None
+    seen, flipped_crops = _in_a_mirror(target, block, best, query, rankings)
     starts = Hypotheses.cat([_of_best_views(target, seen, row) for row in alike])
+    fitted, support = with_short_fit(target.describer, flipped_crops, starts)
+    rows = best_within(support, fitted.photograph)
+    _, own_support = by_contours(short_fit, target.describer, crops, best[alike], radii=())
+    rows = rows[support[rows] >= own_support]
+    if not len(rows):
+        return highest
+    poses = placed(fitted[rows], fitted.short_fit[rows], target.describer.centre)
+    poses = fitted_poses(target, seen, flipped_crops, poses, refit=True)
+    poses = with_evidence(target, seen, poses)
     weights = target.score_weights(exact=True)
     of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
-    own = best.evidence.scores(of_shape)
-    fitted, _ = with_short_fit(target.describer, crops, starts)
-    fitted = placed(fitted, fitted.short_fit, target.describer.centre)
-    fitted = with_evidence(target, seen, fitted)
-    fitted = fitted[fitted.best(of_shape)]
-    gain = fitted.evidence.scores(of_shape) - own[fitted.photograph]
-    near = (gain > -PROMISING).nonzero()[:, 0]
-    if len(near):
-        poses = fitted_poses(target, seen, crops, fitted[near], refit=True)
-        poses = with_evidence(target, seen, poses)
-        gain[near] = poses.evidence.scores(of_shape) - own[poses.photograph]
-    return highest.index_copy(0, fitted.photograph, gain)
+    own = best[poses.photograph].evidence.scores(of_shape)
+    return highest.index_copy(0, poses.photograph, poses.evidence.scores(of_shape) - own)
 
 
 def _in_a_mirror(
@@ -101,14 +99,16 @@ def _in_a_mirror(
     best: Hypotheses,
     query: QueryFeatures,
     rankings: Sequence[Ranking],
-) -> Block:
-    """The photographs of the ``best`` poses, flipped, with the cameras of these."""
+) -> tuple[Block, EdgeCrops]:
+    """The photographs of the ``best`` poses, flipped, with the cameras of these; and their
+    crops."""
     photographs = [
         flipped(block.photographs[p], K)
         for p, K in zip(best.photograph.tolist(), best.cameras, strict=True)
     ]
     seen = described(target, photographs, query, rankings, contours=True, keypoints=False)
-    return Block(
+    assert seen.crops is not None
+    flipped_block = Block(
         **vars(seen),
         photographs=photographs,
         limits=[None] * len(photographs),
@@ -116,6 +116,7 @@ def _in_a_mirror(
         symmetries=block.symmetries,
         tried_cameras=torch.zeros(len(photographs), dtype=torch.bool),
     )
+    return flipped_block, seen.crops
 
 
 def _of_best_views(target: Target, block: Block, photograph: int) -> Hypotheses:

@@ -314,7 +314,7 @@ def register(
     if block.crops is None or not block.exact:
         return results
     best = compared[compared.best(target.score_weights(exact=True))]
-    results = compared_with_mirror_image(target, block, best, results)
+    results = compared_with_mirror_image(target, block, block.crops, best, results)
     return with_checked_cameras(target, block, block.crops, best, results)
 
 
