@@ -2,7 +2,9 @@
 
 import math
 import re
+from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -16,8 +18,9 @@ from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.block import Block
 from curvireg_torch.registration.camera import focal_contradiction, stretch_contradiction
 from curvireg_torch.registration.hypotheses import Hypotheses
+from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support import learned_registrar, seeded, seen_from
+from tests._support import double, learned_registrar, seeded, seen_from
 from tests._support.spies import spied
 
 SIZE = (360, 480)
@@ -193,6 +196,23 @@ def test_prints_are_those_of_photographs_in_which_keypoints_count(monkeypatch, k
     options = measure.call_args.kwargs
     assert options["printed"].tolist() == [keypoints > 0.0]
     assert options["known"].tolist() == [True]
+
+
+def test_reliable_answers_are_compared_each_with_its_own_camera(monkeypatch):
+    result, (_, _, pose) = registered(1.0)
+    results = [result.scaled(0.2), result, result]
+    cameras = torch.stack([camera(factor) for factor in (1.0, 1.25, 1.5)])
+    best = replace(Hypotheses.cat([pose] * 3), cameras=cameras)
+    item = as_photograph(*near_photograph(), camera(1.0))
+    block = SimpleNamespace(photographs=[item] * 3, printed=lambda _: 0.0)
+    measure = Mock(return_value=(double([[0.0, 0.5]] * 2), double([[0.01, 0.01]] * 2)))
+    monkeypatch.setattr(camera_module, "camera_gaps", measure)
+    target = SimpleNamespace(describer=None)
+    found = camera_module.with_checked_cameras(target, block, None, best, results)
+    assert measure.call_args.args[2].cameras.tolist() == cameras[1:].tolist()
+    assert found[0].warnings == result.warnings
+    assert "not the camera's 500 px" in found[1].warnings[-1]
+    assert "not the camera's 600 px" in found[2].warnings[-1]
 
 
 def test_contradictions_need_a_clear_focal_length_two_deviations_and_a_distance_that_matters():

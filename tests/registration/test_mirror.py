@@ -82,24 +82,21 @@ def test_a_mirrored_mesh_is_not_sought_in_other_boxes(gain, boxes, monkeypatch):
 
 
 def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
-    gains = []
-    measure = mirror_image.mirror_gain
-
-    def recorded(*given):
-        gain = measure(*given)
-        gains.extend(gain.tolist())
-        return gain
-
-    monkeypatch.setattr(mirror_image, "mirror_gain", recorded)
+    given = spied(monkeypatch, mirror_image, "mirror_gain")
     assert answer_to(0, learned_registrar()).reliable
-    assert gains.pop() < -1.0
     bank = bank_around(mirrored(learned_registrar().bank.mesh.surface), 30, [0, 30, 60])
     monkeypatch.setattr(mirror_image, "LEAST_CONFIDENCE", 0.0)
     image, box, _ = scene(0)
     last = image.shape[-1] - 1
     x0, y0, x1, y1 = box.tolist()
-    boxes = torch.tensor([[x0, y0, x1, y1], [last - x1, y0, last - x0, y1]])
-    both = exact_registrar(bank)([image, image.flip(-1)], boxes, CAMERA)
-    assert [mirror_image.MIRROR_WARNING in result.warnings for result in both] == [True, False]
-    assert gains[0] > 1.0
-    assert gains[1] < -1.0
+    boxes = torch.tensor([[last - x1, y0, last - x0, y1], [x0, y0, x1, y1]])
+    both = exact_registrar(bank)([image.flip(-1), image], boxes, CAMERA)
+    assert [mirror_image.MIRROR_WARNING in result.warnings for result in both] == [False, True]
+    (own,) = mirror_image.mirror_gain(*given[0])
+    assert own < -1.0
+    right, wrong = mirror_image.mirror_gain(*given[1])
+    assert right < -1.0
+    assert wrong > 1.0
+    *known, best = given[1]
+    alone = mirror_image.mirror_gain(*known, best[[1]])
+    assert alone.tolist() == pytest.approx([float(wrong)], abs=0.05)
