@@ -70,6 +70,12 @@ def test_confidence_falls_where_the_mirror_image_fits_better(monkeypatch):
             assert result.confidence < 0.5
 
 
+def test_a_mesh_that_is_its_own_mirror_image_is_not_compared(monkeypatch):
+    monkeypatch.setattr(mirror_image, "mirror_gain", lambda *_: double([1.5]))
+    monkeypatch.setattr(mirror_image, "is_its_own_mirror_image", lambda _: True)
+    assert answer_to(0, learned_registrar()).reliable
+
+
 @pytest.mark.parametrize(("gain", "boxes"), [(-1.0, 3), (1.5, 1)])
 def test_a_mirrored_mesh_is_not_sought_in_other_boxes(gain, boxes, monkeypatch):
     """In which the flipped photograph may be seen in a wrong one."""
