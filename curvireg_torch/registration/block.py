@@ -23,6 +23,7 @@ from ..mesh.mesh import mesh_centre, mesh_radius
 from ..terms import Appearance, QueryFeatures
 from .hypotheses import (
     Hypotheses,
+    best_views,
     by_contours,
     close_rivals,
     distinct_poses,
@@ -427,6 +428,31 @@ def poses_of_views(
         rank,
         photograph,
     )
+
+
+def poses_of_best_views(
+    target: Target,
+    block: Block,
+    rankings: Sequence[Ranking],
+    places: Sequence[int],
+    boxes: Tensor,
+    counts: Sequence[int],
+) -> Hypotheses:
+    """Poses of the best distinct views of each of R rankings, R ``counts`` of them, of the
+    photographs ``places`` with ``boxes`` (R, 4)."""
+    found = [
+        best_views(ranking, target.bank, count=count, symmetries=block.symmetries)
+        for ranking, count in zip(rankings, counts, strict=True)
+    ]
+    which = torch.arange(len(places)).repeat_interleave(
+        torch.tensor([len(view) for view, _ in found], dtype=torch.long)
+    )
+    no_view = torch.zeros(0, dtype=torch.long)
+    view = torch.cat([no_view, *(view for view, _ in found)])
+    rank = torch.cat([no_view.double(), *(rank for _, rank in found)])
+    photograph = torch.tensor(places, dtype=torch.long)[which]
+    poses = poses_of_views(target, block, view, rank, photograph, boxes=boxes[which])
+    return block.moved_inside(poses)
 
 
 def keypoint_poses(target: Target, matches: KeypointMatches | None) -> tuple[Hypotheses, Tensor]:

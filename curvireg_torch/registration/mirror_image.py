@@ -17,9 +17,9 @@ from ..matching import Ranking
 from ..mesh.reflections import is_its_own_mirror_image
 from ..terms import QueryFeatures
 from ..utils.segments import best_within
-from .block import Block, described, fitted_poses, poses_of_views, with_evidence
+from .block import Block, described, fitted_poses, poses_of_best_views, with_evidence
 from .confidence import resolution
-from .hypotheses import Hypotheses, best_views, by_contours, placed, with_short_fit
+from .hypotheses import Hypotheses, by_contours, placed, with_short_fit
 from .photograph import Photograph
 from .result import DETERMINING_KEYPOINTS, Registration
 from .target import Target
@@ -77,7 +77,9 @@ def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     if not alike:
         return highest
     seen, flipped_crops = _in_a_mirror(target, block, best, query, rankings)
-    starts = Hypotheses.cat([_of_best_views(target, seen, row) for row in alike])
+    tried = [rankings[row] for row in alike]
+    counts = [TRIED_VIEWS] * len(alike)
+    starts = poses_of_best_views(target, seen, tried, alike, seen.boxes[alike], counts)
     fitted, support = with_short_fit(target.describer, flipped_crops, starts)
     rows = best_within(support, fitted.photograph)
     _, own_support = by_contours(short_fit, target.describer, crops, best[alike], radii=())
@@ -117,14 +119,6 @@ def _in_a_mirror(
         tried_cameras=torch.zeros(len(photographs), dtype=torch.bool),
     )
     return flipped_block, seen.crops
-
-
-def _of_best_views(target: Target, block: Block, photograph: int) -> Hypotheses:
-    """Poses of the best views in one photograph."""
-    view, rank = best_views(
-        block.rankings[photograph], target.bank, count=TRIED_VIEWS, symmetries=block.symmetries
-    )
-    return poses_of_views(target, block, view, rank, torch.full_like(view, photograph))
 
 
 def flipped(item: Photograph, K: Tensor) -> Photograph:

@@ -25,6 +25,7 @@ from .block import (
     fitted_poses,
     keypoint_poses,
     least_starts,
+    poses_of_best_views,
     poses_of_views,
     refitted,
     with_evidence,
@@ -41,7 +42,6 @@ from .confidence import are_near
 from .hypotheses import (
     Hypotheses,
     are_repeated,
-    best_views,
     common_score,
     distinct_poses,
     fit_texture_of,
@@ -406,7 +406,7 @@ def _promising(target: Target, block: Block) -> Hypotheses:
     rankings = [block.rankings[p] for p in places]
     boxes = block.boxes
     counts = [screened] * len(places)
-    poses = _of_best_views(target, block, rankings, places, boxes[places], counts)
+    poses = poses_of_best_views(target, block, rankings, places, boxes[places], counts)
     if block.crops is None:
         return poses
     photographs = torch.bincount(poses.photograph, minlength=len(block))
@@ -434,7 +434,7 @@ def _in_larger_boxes(target: Target, block: Block, count: int) -> Hypotheses | N
     counts = [views for _, _, views in larger]
     query = target.matcher.query([block.photographs[p].image for p in places], boxes)
     rankings = _rankings(target, query, [block.limits[p] for p in places])
-    return _of_best_views(target, block, rankings, places, boxes, counts)
+    return poses_of_best_views(target, block, rankings, places, boxes, counts)
 
 
 def _larger_boxes(target: Target, item: Photograph, count: int) -> list[tuple[Tensor, int]]:
@@ -444,31 +444,6 @@ def _larger_boxes(target: Target, item: Photograph, count: int) -> list[tuple[Te
     if target.boxes_are_visible:
         boxes += [(box, VIEWS_OF_HIDDEN) for box in hidden_boxes(item.box)]
     return boxes
-
-
-def _of_best_views(
-    target: Target,
-    block: Block,
-    rankings: Sequence[Ranking],
-    places: Sequence[int],
-    boxes: Tensor,
-    counts: Sequence[int],
-) -> Hypotheses:
-    """Poses of the best distinct views of each of R rankings, R ``counts`` of them, of the
-    photographs ``places`` with ``boxes`` (R, 4)."""
-    found = [
-        best_views(ranking, target.bank, count=count, symmetries=block.symmetries)
-        for ranking, count in zip(rankings, counts, strict=True)
-    ]
-    which = torch.arange(len(places)).repeat_interleave(
-        torch.tensor([len(view) for view, _ in found], dtype=torch.long)
-    )
-    no_view = torch.zeros(0, dtype=torch.long)
-    view = torch.cat([no_view, *(view for view, _ in found)])
-    rank = torch.cat([no_view.double(), *(rank for _, rank in found)])
-    photograph = torch.tensor(places, dtype=torch.long)[which]
-    poses = poses_of_views(target, block, view, rank, photograph, boxes=boxes[which])
-    return block.moved_inside(poses)
 
 
 def _screened(target: Target, crops: EdgeCrops, poses: Hypotheses, count: int) -> Hypotheses:
@@ -585,7 +560,7 @@ def _searched(target: Target, block: Block) -> list[Registration]:
     results = []
     for p, (ranking, query) in enumerate(zip(block.rankings, block.query.split(), strict=True)):
         count = target.pipeline.hypotheses
-        poses = _of_best_views(target, block, [ranking], [p], block.boxes[p : p + 1], [count])
+        poses = poses_of_best_views(target, block, [ranking], [p], block.boxes[p : p + 1], [count])
         rotation, distance = search(target.matcher, query, ranking)
         found = Hypotheses.in_boxes(
             target.describer,
