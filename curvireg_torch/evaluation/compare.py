@@ -20,6 +20,7 @@ Interval = tuple[float, float]
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000  # of the bootstrap
+DRAWN_AT_ONCE = 500_000  # objects of resamples, which bounds the memory
 SEED = 0
 ADVICE = "the same 'curvireg evaluate' again writes it without registering anything"
 README = "docs/evaluation.md"
@@ -163,10 +164,15 @@ def _compared(
         return Comparison(
             score, 0, math.nan, math.nan, unknown, unknown, math.nan, unknown, 0, 0, p
         )
-    chosen = np.random.default_rng(SEED).integers(0, len(a), (RESAMPLES, len(a)))
+    rng = np.random.default_rng(SEED)
+    at_once = max(1, DRAWN_AT_ONCE // len(a))
+    summaries = []
     with np.errstate(invalid="ignore"):  # a miss has an infinite error, and a median may be one
-        first = summarise(a[chosen], axis=1)
-        second = summarise(b[chosen], axis=1)
+        for start in range(0, RESAMPLES, at_once):
+            shape = (min(at_once, RESAMPLES - start), len(a))
+            chosen = rng.integers(0, len(a), shape)
+            summaries.append([summarise(values[chosen], axis=1) for values in (a, b)])
+        first, second = np.concatenate(summaries, axis=1)
         value_a = float(summarise(a))
         value_b = float(summarise(b))
         difference = value_b - value_a

@@ -2,6 +2,8 @@
 
 import json
 import math
+import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from scipy.stats import binom
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import MissingFileError
+from curvireg_torch.evaluation import compare as module
 from curvireg_torch.evaluation.compare import compare, in_words, read_run
 from tests._support import refused
 from tests._support.lists import written
@@ -80,6 +83,22 @@ def test_intervals_of_many_objects_are_narrow_and_hold_the_truth(tmp_path):
     assert 0.07 < high - low < 0.1
     assert low < each.difference < high
     assert each.p < 1e-4
+
+
+def test_resamples_are_drawn_in_parts_whose_size_changes_nothing(runs, monkeypatch):
+    pair = list(map(read_run, runs))
+    expected = compare(*pair)
+    for at_once in (1, 8 * 7):
+        monkeypatch.setattr(module, "DRAWN_AT_ONCE", at_once)
+        assert compare(*pair) == expected
+    monkeypatch.undo()
+    errors = {str(k): {"error_deg": k, "symmetric_error_deg": k} for k in range(1000)}
+    many = replace(pair[0], errors=errors)
+    tracemalloc.start()
+    compare(many, many)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * module.RESAMPLES * len(errors)  # bytes: less than all resamples hold
 
 
 def test_average_recalls_of_bop_are_compared_by_object(tmp_path):
