@@ -341,21 +341,24 @@ class _File:
             )
         kind = np.dtype(_TYPES[accessor["componentType"]])
         shape = (accessor["count"], _WIDTHS[accessor["type"]])
-        stored = np.zeros(shape, kind)
-        if "bufferView" in accessor:
-            stored = self._viewed(accessor, kind, shape)
         if "sparse" not in accessor:
-            return stored
+            return self._viewed(accessor, kind, shape)
         sparse = accessor["sparse"]
         count = _natural(sparse["count"])
-        if count > len(stored):
+        if count > shape[0]:
             raise ValueError("a sparse accessor names more values than it has")
         index_kind = np.dtype(_TYPES[sparse["indices"]["componentType"]])
         places = self._viewed(sparse["indices"], index_kind, (count, 1))[:, 0].astype(np.int64)
         values = self._viewed(sparse["values"], kind, (count, shape[1]))
-        if count and not 0 <= places.min() <= places.max() < len(stored):
+        if count and not 0 <= places.min() <= places.max() < shape[0]:
             raise ValueError("a sparse accessor names a value that it does not have")
-        stored = stored.copy()
+        if "bufferView" in accessor:
+            stored = self._viewed(accessor, kind, shape).copy()
+        else:
+            # Zeros are not in the file; what else it says of each value takes a byte or more
+            if shape[0] > sum(map(len, self._buffers.values())):
+                raise ValueError("a sparse accessor has more values than its buffers have bytes")
+            stored = np.zeros(shape, kind)
         stored[places] = values
         return stored
 

@@ -86,6 +86,7 @@ CHANGES = """
 {"asset": {"version": "1.0"}}                                 | version 2
 {"meshes": 5}                                                 | valid glTF
 {"accessors": [{"componentType": 5126, "count": 30000000, "type": "VEC3"}]} | has no data
+{"accessors": [{"componentType": 5126, "count": 30000000, "type": "VEC3", "sparse": {"count": 1, "indices": {"bufferView": 0, "componentType": 5121}, "values": {"bufferView": 0}}}]} | more values than
 """  # noqa: E501
 ACCESSORS = """
 {"count": 1000000000}    | claim more than
