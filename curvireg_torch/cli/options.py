@@ -161,6 +161,7 @@ CONFLICTS = {
     "boxes start": "--start is the pose, so that no box is needed; leave --boxes out",
     "boxes list": "the list holds boxes; leave --boxes out",
     "box start": "--start is the pose, so that no box is needed; leave --box out",
+    "box_format boxes|views": "--box-format: of --box or the boxes of a list; leave it out",
     "box_format !box !list": "--box-format: of --box or the boxes of a list; give them too",
     "scheduler jobs": "expected one of --jobs and --scheduler",
     "gpu jobs": "--jobs: processes are for the CPU; a GPU registers photographs together",

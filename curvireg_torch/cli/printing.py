@@ -149,7 +149,7 @@ def _suspicious_box(inputs: Document) -> str:
     if box is None or picture is None:
         return ""
     if max(box) <= 100.0 < min(picture["width"], picture["height"]):
-        return "the box is in px: of percent, divide it by 100 and add --box-format fractions"
+        return "the box is in px: of percent, multiply it by the photograph's size / 100"
     if (orientation := picture["orientation"]) != 1:
         return (
             f"box and mask are of the photograph as it is shown, with its EXIF orientation "

@@ -271,7 +271,7 @@ def test_advice_names_what_was_measured_or_says_less():
     assert "contours" not in _advice(document), "few edges alone are no cause"
     for change, words in (
         *text_table(ADVICE),
-        (inputs_with(box=[34.8, 20.3, 74, 79.7]), "of percent, divide it by 100"),
+        (inputs_with(box=[34.8, 20.3, 74, 79.7]), "of percent, multiply it by"),
         (inputs_with(box=[34.8, 20.3, 174, 79.7]), "check that the box is tight"),
         (inputs_with(width=90, box=[34, 20, 74, 79]), "check that the box is tight"),
         (inputs_with(orientation=6), "EXIF orientation 6 applied"),

@@ -56,7 +56,7 @@ def test_formats_of_four_numbers():
     assert pixel_box((15.5, 11.5, 32.0, 24.0), "xywh") == BOX
     assert pixel_box((0.25, 0.25, 0.75, 0.75), "fractions", SIZE) == BOX
     assert pixel_box((0.5, 0.5, 0.5, 0.5), "yolo", SIZE) == BOX
-    with refused("expected fractions of the picture from 0 to 1; of px, give another format"):
+    with refused("expected fractions of the picture from 0 to 1; divide px by its size"):
         pixel_box((16.0, 12.0, 47.0, 35.0), "yolo", SIZE)
     with refused("not of a video"):
         pixel_box((0.5, 0.5, 0.5, 0.5), "yolo")
@@ -420,10 +420,13 @@ def test_messages_name_the_format_that_is_suspected():
     for box, words in (
         (
             [0.3, 0.2, 0.7, 0.8],
-            "in px, not fractions of the photograph; multiply them by its size, or give "
-            "--box-format fractions, or yolo",
+            "in px, not fractions of the photograph; multiply them by its size, or "
+            "add --box-format fractions, or yolo, to --box or a list",
         ),
-        ([40.0, 30.0, 20.0, 15.0], "corners, not width and height, or --box-format xywh"),
+        (
+            [40.0, 30.0, 20.0, 15.0],
+            "corners, not width and height, or add --box-format xywh to --box or a list",
+        ),
         ([5.0, 5.0, 10.0, 40.0], "the part of the photograph in the box has 5.0 px"),
     ):
         (found,) = as_photographs(pictures, [box], None)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from ...errors import CurviregWarning, InvalidInputError, MissingFileError
 from ...utils.aliases import PathName, Size
-from ...utils.choices import BOX_FORMATS, listed
+from ...utils.choices import listed
 from ...utils.files import split_name, without_zeros
 from .files import (
     ANY_FOLDER,
@@ -66,10 +66,8 @@ def pixel_box(numbers: Sequence[float], box_format: str, size: Size | None = Non
 
 def _of_fractions(corners: Corners, size: Size) -> Corners:
     if not all(-0.5 <= value <= 1.5 for value in corners):
-        kinds = ", ".join(BOX_FORMATS)
         raise InvalidInputError(
-            f"box: expected fractions of the picture from 0 to 1; of px, give another format "
-            f"({kinds})"
+            "box: expected fractions of the picture from 0 to 1; divide px by its size"
         )
     height, width = size
     return _from_centre(corners, width, height)
