@@ -7,10 +7,10 @@ photographs.
 The script renders the sets of sets.json that WORK lacks (the object's own mesh, also cut by the
 border, half hidden, grey, or with several poses that look alike; a similar one; a wrong one, or one
 with another print; and sequences), registers, refines, follows and detects their objects into
-WORK/*.jsonl, of which finished rows are kept, and fits. Everything depends on the seeds in the file
-alone: an interrupted run goes on, with any number of --jobs. FURNITURE, the folder of
-scripts/benchmark/meshes.py, adds real meshes to the procedural ones. Folds are by kind of object,
-so every measure is of kinds that the fit has not seen. --write stores the constants in
+WORK/*.jsonl, and fits. Everything depends on the seeds in the file alone: an interrupted run goes
+on, with any number of --jobs, as rows of the same photographs and code are kept. FURNITURE, the
+folder of scripts/benchmark/meshes.py, adds real meshes to the procedural ones. Folds are by kind of
+object, so every measure is of kinds that the fit has not seen. --write stores the constants in
 curvireg_torch/calibration/calibration.json and their quality in scripts/results/calibration.json.
 """
 

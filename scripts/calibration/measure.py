@@ -1,6 +1,7 @@
 """What registrations, refinements, trackers and detections say of generated photographs, and
 whether it is true: a row for each."""
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
@@ -15,12 +16,15 @@ import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.evidence import Evidence
+from curvireg_torch.formats.meshes.files import mesh_digest
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.crops import box_iou
+from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
 from curvireg_torch.mesh import Mesh
 from curvireg_torch.registration import Follower, judging
 from curvireg_torch.registration.confidence import are_near
+from curvireg_torch.utils.files import file_digest, text_digest
 from scripts._shared import measured, read_json
 from scripts.calibration.sets import photographs_of, set_of
 
@@ -243,5 +247,19 @@ def rows_of(work: Path, kind: str, jobs: int) -> list[Row]:
         indices = [i for _, _, i in group]
         scenes = {scene for scene, obj_id, _ in listed if obj_id == key[0]}
         beside = next((i for scene, _, i in listed if scene not in scenes), 0)
-        tasks[str(list(key))] = (kind, folder, "any" if key[1] else "upright", indices, beside)
+        pose = "any" if key[1] else "upright"
+        request = request_of(kind, pose, [annotations[i] for i in (*indices, beside)])
+        tasks[request] = (kind, folder, pose, indices, beside)
     return measured(work / f"{kind}.jsonl", measure, tasks, jobs, kind)
+
+
+def request_of(kind: str, pose: str, samples: Sequence[Row]) -> str:
+    """Digest of all that the rows of a mesh depend on: its photographs, that beside them, and the
+    code."""
+    chosen = set_of(kind)
+    first = samples[0]
+    is_of = [chosen.photographs, chosen.model, is_grey(kind, first["obj_id"])]
+    code = [results_digest(), Path(__file__).read_text(encoding="utf-8")]
+    seen = [(s["scene_id"], s["obj_id"], file_digest(Path(s["image_path"]))) for s in samples]
+    mesh = mesh_digest(Path(first["model_path"]))
+    return text_digest(json.dumps([kind, pose, is_of, code, mesh, seen]))

@@ -1,5 +1,6 @@
 """Fits of the calibration, and what its generated sets show."""
 
+import shutil
 from argparse import Namespace
 
 import numpy as np
@@ -15,6 +16,7 @@ from scripts.benchmark.make import TWIN, Packages, Shapes, Tied
 from scripts.calibration import fits, measure, sets
 from scripts.calibration.calibrate import covariance_quality
 from scripts.scenes.scene import SIZE, cut, look_at
+from tests._support.miniature import write_bop, write_image
 
 
 def options(**changes):
@@ -75,6 +77,30 @@ def test_sets_of_furniture_are_left_out_where_there_is_none(tmp_path):
     assert "furniture" in sets.sets_of(["instance"], tmp_path)
     shared = {name for name, each in sets.SETS.items() if each.share}
     assert shared < set(sets.sets_of(["instance"], None))
+
+
+def test_rows_are_kept_of_the_same_photographs_and_code_alone(tmp_path, monkeypatch):
+    write_bop(tmp_path / "shapes")
+    (tmp_path / "shapes" / "test_targets_bop19.json").unlink()
+    scenes = tmp_path / "shapes" / "test"
+    tasks = []
+    monkeypatch.setattr(measure, "measure", lambda task: tasks.append(task) or [task[3]])
+
+    def measured():
+        tasks.clear()
+        kept = measure.rows_of(tmp_path, "shapes", 1)
+        return [task[3] for task in tasks], kept
+
+    upright, one, two = [3], [0, 2], [1]
+    assert measured() == ([upright, one, two],) * 2
+    assert measured() == ([], [upright, one, two])
+    shutil.copytree(scenes / "000001", scenes / "000005")  # of a larger --count
+    more = [[0, 2, 4, 6], [1, 5]]
+    assert measured() == (more, [upright, *more])
+    write_image(scenes / "000002" / "gray" / "000007.png")
+    assert measured()[0] == [upright, [1, 5]], "the photograph beside those of an object counts"
+    monkeypatch.setattr(measure, "results_digest", lambda: "of other code")
+    assert measured()[0] == [upright, *more]
 
 
 def test_twins_have_the_same_shape_and_another_print():
