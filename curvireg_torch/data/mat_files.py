@@ -46,7 +46,7 @@ def read_mats(paths: Sequence[Path], variable: str) -> Iterator[MatValue]:
                 )
             lines = found.read_bytes().splitlines(keepends=True)
             values = [json.loads(line) for line in lines if line.endswith(b"\n")]
-            if len(values) < len(some):  # this one ended the process
+            if not values:  # the first one ended the process; another is tried again as the first
                 values.append(None)
             yield from values
             del names[: len(values)]

@@ -1,10 +1,12 @@
 import json
 import struct
 import zlib
+from pathlib import Path
 
 import numpy as np
 import scipy.io
 
+from curvireg_torch.data import mat_files
 from curvireg_torch.data.mat_files import read_mats
 from curvireg_torch.errors import MAX_MAT_BYTES, WorkerError
 from tests._support.miniature import pascal_object, write_record
@@ -118,3 +120,18 @@ def test_damaged_files_have_a_value_or_none(tmp_path):
     assert len(values) == 41
     assert values.count(None) > 10
     assert [entry["class"] for entry in values[-1][0]["objects"]] == ["car", "sofa"]
+
+
+def test_a_file_that_is_read_at_the_time_limit_is_not_lost(monkeypatch):
+    calls = []
+
+    def interrupted(_, asked_and_found, **__):
+        asked, found = map(Path, asked_and_found)
+        _, _, *names = json.loads(asked.read_text())
+        calls.append(names)
+        found.write_text("".join(f"{json.dumps(name)}\n" for name in names[:2]))
+
+    monkeypatch.setattr(mat_files, "run_program", interrupted)
+    paths = [Path(name) for name in "abc"]
+    assert list(read_mats(paths, "record")) == ["a", "b", "c"]
+    assert calls == [["a", "b", "c"], ["c"]]
