@@ -146,6 +146,19 @@ def boxes_around(pixels: Tensor) -> Tensor:
     return torch.cat([pixels.amin(dim=-2), pixels.amax(dim=-2)], dim=-1)
 
 
+def boxes_of(
+    points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False
+) -> Tensor:
+    """(..., 4) :func:`projected_boxes` of points (P, 3), without their checks."""
+    T = T_cam_from_model.reshape(-1, 4, 4)
+    # A row's largest element is found in a tenth of the time of a column's.
+    cam = torch.baddbmm(T[:, :3, 3:], T[:, :3, :3], points.T.expand(len(T), -1, -1))
+    xy = cam[:, :2] if orthographic else cam[:, :2] / cam[:, 2:]
+    focal = K[..., :2, :2].diagonal(dim1=-2, dim2=-1)
+    ends = (end.view(*T_cam_from_model.shape[:-2], 2) for end in (xy.amin(dim=-1), xy.amax(dim=-1)))
+    return torch.cat([end * focal + K[..., :2, 2] for end in ends], dim=-1)
+
+
 def rotation_towards(rays: Tensor) -> Tensor:
     """(..., 3, 3) smallest rotations with ``R (0, 0, 1) = ray / |ray|``, for (..., 3) rays with z >
     0: they turn allocentric rotations into poses.
@@ -215,7 +228,8 @@ def pose_from_box(
         raise InvalidInputError(f"box: expected finite X0 < X1 and Y0 < Y1, got {box.tolist()}")
     points, view, box, K = (v.detach().cpu().double() for v in (points, rotation, box, K))
     centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
-    extent = torch.linalg.vector_norm(points - centre, dim=1).max()
+    centred = points - centre
+    extent = torch.linalg.vector_norm(centred, dim=1).max()
     size = box[..., 2:] - box[..., :2]
     middle = 0.5 * (box[..., :2] + box[..., 2:])
     inverse = torch.linalg.inv(K)
@@ -227,9 +241,7 @@ def pose_from_box(
     for _ in range(MAX_BOX_ITERATIONS):
         # Each pose stops on its own: it does not depend on the others.
         R = torch.where(moving[..., None, None], rotation_towards(position) @ view, R)
-        low, high = boxes_around(projected(points - centre, transform(R, position), K)).split(
-            2, dim=-1
-        )
+        low, high = boxes_of(centred, transform(R, position), K).split(2, dim=-1)
         zoom = ((high - low) * size).sum(dim=-1, keepdim=True) / (size * size).sum(
             dim=-1, keepdim=True
         )

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..utils.aliases import Size
-from .cameras import boxes_around, project_points, projected
+from .cameras import boxes_of, project_points
 from .crops import crop_transforms, image_transforms, square_boxes
 
 BORDER = 1.5  # Pixels from the border within which a side of a box lies on it
@@ -169,7 +169,7 @@ def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: Size) -> tuple[Tensor, Te
     ``size`` (H, W). And (N,) bool, False where the mesh lies behind the camera, or outside the
     image: there the box means nothing."""
     depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
-    boxes = boxes_around(projected(hull, T, K))
+    boxes = boxes_of(hull.to(T), T, K)
     limits = torch.tensor([size[1], size[0]], dtype=boxes.dtype) - 0.5
     outside = (boxes[:, :2] >= limits) | (boxes[:, 2:] <= -0.5) | (depth <= 0)[:, None]
     return boxes, ~outside.any(dim=1)

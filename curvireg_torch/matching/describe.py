@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ..features import HOG, field_points
 from ..filters import apparent_ridges, average_shading_gradient
-from ..geometry.cameras import boxes_around, projected, transform
+from ..geometry.cameras import boxes_of, transform
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..mesh.edges import simplified
 from ..mesh.mesh import as_mesh, extreme_points, measure, mesh_centre, mesh_radius
@@ -125,7 +125,7 @@ class ViewDescriber:
         t[:, 2] += distances.double().cpu()
         T = transform(R, t)
         K = torch.eye(3, dtype=torch.float64)
-        boxes = boxes_around(projected(self.hull, T, K, orthographic=self._orthographic))
+        boxes = boxes_of(self.hull, T, K, orthographic=self._orthographic)
         return (
             T,
             crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size),

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..geometry.cameras import boxes_around, projected
+from ..geometry.cameras import boxes_of, projected
 from ..geometry.crops import crop_transforms, square_boxes
 from ..matching import ViewDescriber
 from ..rendering.contours import LEVELS
@@ -182,7 +182,7 @@ def contour_pixels(
     K = K.double().cpu()
     depth = describer.hull @ pose[0, 2, :3] + pose[0, 2, 3]
     if (depth > 0).all():
-        box = boxes_around(projected(describer.hull, pose, K))
+        box = boxes_of(describer.hull, pose, K)
     else:
         box = torch.tensor([[0.0, 0.0, size[1], size[0]]], dtype=torch.float64)
     crop_camera = crop_transforms(square_boxes(box, describer.settings.margin), FIT_SIZE) @ K
