@@ -88,17 +88,18 @@ class QueryFeatures:
     mask: Tensor | None = None
     computed: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
 
+    def __getitem__(self, index: Tensor | slice) -> "QueryFeatures":
+        """Some of the photographs."""
+        known = {field.name: getattr(self, field.name) for field in fields(QueryFeatures)}
+        computed = known.pop("computed")
+        return QueryFeatures(
+            **{name: None if x is None else x[index] for name, x in known.items()},
+            computed={name: x[index] for name, x in computed.items()},
+        )
+
     def split(self) -> "list[QueryFeatures]":
         """Each photograph by itself."""
-        names = [field.name for field in fields(QueryFeatures) if field.name != "computed"]
-        known = [getattr(self, name) for name in names]
-        count = len(self.crops)
-        parts = [[None] * count if x is None else x.split(1) for x in known]
-        queries = [QueryFeatures(*row) for row in zip(*parts, strict=True)]
-        for name, x in self.computed.items():
-            for query, part in zip(queries, x.split(1), strict=True):
-                query.computed[name] = part
-        return queries
+        return [self[k : k + 1] for k in range(len(self.crops))]
 
 
 def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -202,9 +202,17 @@ class HOG(FunctionModule, learnable=("bin_weights",)):
     def rotated_by_180(self, descriptors: Tensor) -> Tensor:
         """Descriptors (B, D) of the fields rotated by 180 degrees: cells are permuted, orientations
         are unchanged."""
+        return self._cells(descriptors).flip(1, 2, 3, 4).flatten(1)
+
+    def mirrored(self, descriptors: Tensor) -> Tensor:
+        """Descriptors (B, D) of the fields as a mirror shows them, whose left is their right, if
+        the weights of bins are equal."""
+        return self._cells(descriptors).flip(2, 4, 5).flatten(1)
+
+    def _cells(self, descriptors: Tensor) -> Tensor:
+        """(B, block row, block column, cell row, cell column, bin) of descriptors (B, D)."""
         n = self.grid - self.block + 1
-        cells = descriptors.view(-1, n, n, self.block, self.block, self.bins)
-        return cells.flip(1, 2, 3, 4).flatten(1)
+        return descriptors.view(-1, n, n, self.block, self.block, self.bins)
 
     def forward(self, field: Tensor) -> Tensor:
         return hog(field, **self.options)

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Self
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError
@@ -294,20 +295,22 @@ class ViewMatcher(nn.Module):
         return Ranking(log.exp(), order, {**terms, **compared}, allowed, outside)
 
     @full_precision()
-    def flipped(self, query: QueryFeatures, index: Tensor) -> tuple[QueryFeatures, Ranking]:
-        """Some of the described photographs (P,) as a mirror shows them, without points, and their
-        ranking by descriptors alone. Their fields are flipped, not computed again."""
-        settings = self.bank.settings
-        mirrored = query.field.new_tensor([-1.0, 1.0]).view(2, 1, 1) * query.field[index]
-        field = mirrored.flip(-1)
-        jittered = jittered_fields(field, self.pipeline.box_jitter, settings.margin)
+    def flipped(self, query: QueryFeatures, views: Tensor) -> tuple[QueryFeatures, Ranking]:
+        """Described photographs (P,) as a mirror shows them, and their ranking by descriptors
+        alone. Of the jittered copies of each, one is left: that which, not flipped, is most like
+        its view among ``views`` (P,). Nothing is filtered or described again."""
+        known = self.bank.descriptors[views.to(self.bank.device)].float()
+        likeness = F.normalize(query.descriptors, dim=2) @ F.normalize(known, dim=1)[..., None]
+        copies = likeness[..., 0].argmax(dim=1)
+        mirror = query.field.new_tensor([-1.0, 1.0]).view(2, 1, 1)
+        rows = torch.arange(len(copies), device=copies.device)
         flipped = QueryFeatures(
-            crops=query.crops[index].flip(-1),
-            field=field,
-            descriptors=self.descriptor(jittered.flatten(0, 1)).unflatten(0, jittered.shape[:2]),
-            points=query.points[:0],
-            shapes=query.shapes[index],
-            mask=None if query.mask is None else query.mask[index].flip(-1),
+            crops=query.crops.flip(-1),
+            field=(mirror * query.field).flip(-1),
+            descriptors=self.descriptor.mirrored(query.descriptors[rows, copies])[:, None],
+            points=query.points[rows, copies][:, None].flip(-1),
+            shapes=query.shapes,
+            mask=None if query.mask is None else query.mask.flip(-1),
         )
         by_name = {term.name: compare for term, compare in self._terms}
         scores = by_name[Correlation.name](flipped)

@@ -67,22 +67,24 @@ def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     its ``best`` pose, by shape alone; minus infinity where no view of it is as much alike, or has
     as much edge support after a short fit."""
     highest = torch.full((len(best),), -torch.inf, dtype=torch.float64)
-    query, ranking = target.matcher.flipped(block.query, best.photograph)
+    own = [block.rankings[p] for p in best.photograph.tolist()]
+    views = torch.cat([ranking.hog.argmax(dim=1) for ranking in own])
+    query, ranking = target.matcher.flipped(block.query[best.photograph], views)
     rankings = ranking.split()
-    alike = [
-        row
-        for row, (p, ranking) in enumerate(zip(best.photograph.tolist(), rankings, strict=True))
-        if float(ranking.hog.max() - block.rankings[p].hog.max()) > -LESS_ALIKE
-    ]
-    if not alike:
+    likeness = torch.cat([ranking.hog.amax(dim=1) for ranking in rankings])
+    own_likeness = torch.cat([ranking.hog.amax(dim=1) for ranking in own])
+    alike = (likeness - own_likeness > -LESS_ALIKE).nonzero()[:, 0]
+    if not len(alike):
         return highest
-    seen, flipped_crops = _in_a_mirror(target, block, best, query, rankings)
-    tried = [rankings[row] for row in alike]
-    counts = [TRIED_VIEWS] * len(alike)
-    starts = poses_of_best_views(target, seen, tried, alike, seen.boxes[alike], counts)
+    some = best[alike]
+    rankings = [rankings[row] for row in alike.tolist()]
+    seen, flipped_crops = _in_a_mirror(target, block, some, query[alike], rankings)
+    places = list(range(len(some)))
+    counts = [TRIED_VIEWS] * len(some)
+    starts = poses_of_best_views(target, seen, rankings, places, seen.boxes, counts)
     fitted, support = with_short_fit(target.describer, flipped_crops, starts)
     rows = best_within(support, fitted.photograph)
-    _, own_support = by_contours(short_fit, target.describer, crops, best[alike], radii=())
+    _, own_support = by_contours(short_fit, target.describer, crops, some, radii=())
     rows = rows[support[rows] >= own_support]
     if not len(rows):
         return highest
@@ -91,8 +93,9 @@ def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     poses = with_evidence(target, seen, poses)
     weights = target.score_weights(exact=True)
     of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
-    own = best[poses.photograph].evidence.scores(of_shape)
-    return highest.index_copy(0, poses.photograph, poses.evidence.scores(of_shape) - own)
+    compared = alike[poses.photograph]
+    own_scores = best[compared].evidence.scores(of_shape)
+    return highest.index_copy(0, compared, poses.evidence.scores(of_shape) - own_scores)
 
 
 def _in_a_mirror(
@@ -102,8 +105,8 @@ def _in_a_mirror(
     query: QueryFeatures,
     rankings: Sequence[Ranking],
 ) -> tuple[Block, EdgeCrops]:
-    """The photographs of the ``best`` poses, flipped, with the cameras of these; and their
-    crops."""
+    """The photographs of the ``best`` poses, flipped and described as the ``query``, with the
+    cameras of these; and their crops."""
     photographs = [
         flipped(block.photographs[p], K)
         for p, K in zip(best.photograph.tolist(), best.cameras, strict=True)

@@ -171,3 +171,11 @@ def test_descriptor_of_a_quarter_turn_is_that_of_the_rotated_field(bins, learnab
         layer.with_quarter_turn(field), (layer(field), layer(rotated)), strict=True
     ):
         assert_close(found, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("bins", [9, 8, 1])
+def test_descriptor_in_a_mirror_is_that_of_the_flipped_field(bins):
+    field = torch.randn(3, 2, 40, 44, generator=seeded(1), dtype=torch.float64)
+    layer = features.HOG(grid=5, bins=bins)
+    flipped = torch.stack([-field[:, 0], field[:, 1]], dim=1).flip(-1)
+    assert_close(layer.mirrored(layer(field)), layer(flipped), rtol=0, atol=1e-9)
