@@ -303,10 +303,8 @@ def register(
         poses, rivals, feature_is_hidden = with_siblings(target, block, block.crops, poses)
         poses = _with_texture(target, block, block.crops, poses)
     poses = _merged(target, block, poses)
-    # Unlike another view, repeated ones started near the pose that they merged with: they are no
-    # rivals.
-    other = (poses.is_distinct | ~begun.is_repeated).nonzero()[:, 0]
-    poses = _with_views_again(target, block, poses[other], begun[other])
+    needed = _needed(poses, begun).nonzero()[:, 0]
+    poses = _with_views_again(target, block, poses[needed], begun[needed])
     if block.crops is not None:
         block, poses = with_focal_deviation(target, block, block.crops, poses)
     compared = Hypotheses.cat([poses, rivals])
@@ -516,6 +514,16 @@ def _merged(target: Target, block: Block, poses: Hypotheses) -> Hypotheses:
         scores = some.evidence.scores(weights)
         is_distinct[rows] = distinct_poses(some, scores, block.symmetries, angle=angle)
     return replace(poses, is_distinct=is_distinct)
+
+
+def _needed(poses: Hypotheses, starts: Hypotheses) -> Tensor:
+    """(N,) bool: the poses that did not merge with a better one; where one alone is left of a
+    photograph, also those that merged with it, whose views tell how clear it is. Repeated starts
+    were near it."""
+    counted = (poses.is_distinct & ~poses.is_outside).long()
+    left = torch.zeros(int(poses.photograph.max()) + 1, dtype=torch.long)
+    is_alone = left.index_add(0, poses.photograph, counted)[poses.photograph] <= 1
+    return poses.is_distinct | (is_alone & ~starts.is_repeated)
 
 
 def _with_views_again(
