@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..utils.aliases import Size
-from .cameras import boxes_of, project_points
+from .cameras import boxes_of, projected
 from .crops import crop_transforms, image_transforms, square_boxes
 
 BORDER = 1.5  # Pixels from the border within which a side of a box lies on it
@@ -149,13 +149,13 @@ def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: Size) -> float:
     depth = hull.to(T) @ T[2, :3] + T[2, 3]
     if float(depth.min()) <= 0.0:
         return 1.0
-    pixels = project_points(hull.to(T), T[None], K[None])[0].numpy()
+    pixels = projected(hull.to(T), T, K).numpy()
     x0, y0, x1, y1 = photograph_box(size).tolist()
+    if (pixels >= (x0, y0)).all() and (pixels <= (x1, y1)).all():
+        return 0.0  # not what rounding leaves of the areas' difference
     # In units of the photograph's longer side: OpenCV computes in single precision.
     scale = 1.0 / max(size)
     outline = cv2.convexHull((scale * pixels).astype(np.float32))
-    if (pixels >= (x0, y0)).all() and (pixels <= (x1, y1)).all():
-        return 0.0  # not what rounding leaves of the areas' difference
     frame = scale * np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     whole = cv2.contourArea(outline)
     if whole <= 0.0:

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Self
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError
@@ -295,20 +294,16 @@ class ViewMatcher(nn.Module):
         return Ranking(log.exp(), order, {**terms, **compared}, allowed, outside)
 
     @full_precision()
-    def flipped(self, query: QueryFeatures, views: Tensor) -> tuple[QueryFeatures, Ranking]:
-        """Described photographs (P,) as a mirror shows them, and their ranking by descriptors
-        alone. Of the jittered copies of each, one is left: that which, not flipped, is most like
-        its view among ``views`` (P,). Nothing is filtered or described again."""
-        known = self.bank.descriptors[views.to(self.bank.device)].float()
-        likeness = F.normalize(query.descriptors, dim=2) @ F.normalize(known, dim=1)[..., None]
-        copies = likeness[..., 0].argmax(dim=1)
+    def flipped(self, query: QueryFeatures) -> tuple[QueryFeatures, Ranking]:
+        """Described photographs as a mirror shows them, and their ranking by descriptors alone.
+        Nothing is filtered or described again."""
         mirror = query.field.new_tensor([-1.0, 1.0]).view(2, 1, 1)
-        rows = torch.arange(len(copies), device=copies.device)
+        descriptors = self.descriptor.mirrored(query.descriptors.flatten(0, 1))
         flipped = QueryFeatures(
             crops=query.crops.flip(-1),
             field=(mirror * query.field).flip(-1),
-            descriptors=self.descriptor.mirrored(query.descriptors[rows, copies])[:, None],
-            points=query.points[rows, copies][:, None].flip(-1),
+            descriptors=descriptors.view_as(query.descriptors),
+            points=query.points.flip(-1),
             shapes=query.shapes,
             mask=None if query.mask is None else query.mask.flip(-1),
         )

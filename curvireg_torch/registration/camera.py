@@ -353,6 +353,13 @@ NOTICED_STEP = 0.02
 """First step of log f from which a focal length is fitted: with the right camera most first steps
 are smaller, and a fit takes ten times as long as a step."""
 
+UNKNOWN = torch.tensor([ASPECT, FOCAL_LENGTH], dtype=torch.float64)  # powers that are fitted
+
+DOUBTFUL_ASPECT = 0.014
+"""Standard deviation of log fx / fy at the fitted pose from which it is fitted: contours of
+stretched photographs lie beside edges, by which it rises to more than that in all that are
+named. Half of the others stay below."""
+
 WITHIN_REACH = 2.0 * CLEAR_DEVIATION
 """Standard deviation up to which, at the fitted pose, a focal length is worth a fit to contours. A
 fit lowers the deviation, to a third where the given one is 1.3 times the right focal length."""
@@ -420,29 +427,32 @@ def camera_gaps(
     Returns:
         (N, 2) by how much the logarithms of fx / fy and of the focal length that a photograph shows
         exceed those of its camera, and (N, 2) their standard deviations, infinite where nobody
-        looked further, as the first step or a fit at half the size is small, or the photograph does
-        not determine them.
+        looked further, as they seem right at the pose or after a fit at half the size, or the
+        photograph does not determine them.
     """
     gap = torch.zeros(len(poses), 2, dtype=torch.float64)
     deviation = torch.full_like(gap, torch.inf)
     problem = ContourProblem.of(describer.contours, crops, poses.cameras, poses.photograph)
-    first, _ = camera_information(problem, problem.state(poses.T), FULL_SIZE_RADII[0])
-    expected = (REPORTED_VARIANCE * first.variance).sqrt()
-    noticed = known & (first.step.abs() > NOTICED_STEP)
-    by_contours = noticed & (expected < WITHIN_REACH)
+    twice = torch.arange(len(poses)).repeat(2)
+    column = torch.arange(2).repeat_interleave(len(poses))
+    state = problem.state(poses.T)[twice]
+    first, _ = camera_information(problem[twice], state, FULL_SIZE_RADII[0], powers=UNKNOWN[column])
+    expected = (REPORTED_VARIANCE * first.variance).sqrt().view(2, -1)
+    noticed = known & (first.step.view(2, -1)[1].abs() > NOTICED_STEP)
+    by_contours = torch.stack(
+        [expected[0] > DOUBTFUL_ASPECT, noticed & (expected[1] < WITHIN_REACH)]
+    )
     for row in (noticed & printed).nonzero()[:, 0].tolist():
         one = slice(row, row + 1)
         found = _fitted_to_print(describer, crops, poses[one], problem[one])
         if found is not None:
             gap[row, 1], deviation[row, 1] = found
-            by_contours[row] = False
-    every = torch.arange(len(poses))
-    focal = by_contours.nonzero()[:, 0]
-    row = torch.cat([every, focal])
-    column = torch.cat([torch.zeros_like(every), torch.ones_like(focal)])
-    gap[row, column], deviation[row, column] = _fitted_to_contours(
-        describer, crops, poses[row], column
-    )
+            by_contours[1, row] = False
+    column, row = by_contours.nonzero().T
+    if len(row):
+        gap[row, column], deviation[row, column] = _fitted_to_contours(
+            describer, crops, poses[row], column
+        )
     return gap, torch.where(deviation < CLEAR_DEVIATION, deviation, torch.inf)
 
 
@@ -469,7 +479,7 @@ def _fitted_to_contours(
 ) -> tuple[Tensor, Tensor]:
     """Gaps and deviations (N,), see :func:`camera_gaps`, in this ``column`` (N,), by contours
     alone."""
-    powers = torch.tensor([ASPECT, FOCAL_LENGTH], dtype=torch.float64)[column]
+    powers = UNKNOWN[column]
     smallest = torch.tensor([SMALLEST_STRETCH, SMALLEST_GAP], dtype=torch.float64)[column]
     half = ContourProblem.of(describer.contours, crops, poses.cameras, poses.photograph, factor=2)
     coarse = fit_camera(half, poses.T, _no_prior(poses.cameras, powers), HALF_RADII)

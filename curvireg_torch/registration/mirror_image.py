@@ -68,8 +68,7 @@ def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     as much edge support after a short fit."""
     highest = torch.full((len(best),), -torch.inf, dtype=torch.float64)
     own = [block.rankings[p] for p in best.photograph.tolist()]
-    views = torch.cat([ranking.hog.argmax(dim=1) for ranking in own])
-    query, ranking = target.matcher.flipped(block.query[best.photograph], views)
+    query, ranking = target.matcher.flipped(block.query[best.photograph])
     rankings = ranking.split()
     likeness = torch.cat([ranking.hog.amax(dim=1) for ranking in rankings])
     own_likeness = torch.cat([ranking.hog.amax(dim=1) for ranking in own])
