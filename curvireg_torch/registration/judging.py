@@ -130,7 +130,8 @@ def judged(
         target: the object.
         block: the photograph, among others.
         photograph: its number in the block.
-        poses: those in it; those that merged with a better one have returned to their views.
+        poses: those in it, of which some that merged with the only other one have returned to
+            their views.
     """
     weights = target.score_weights(exact=block.exact)
     item = block.photographs[photograph]

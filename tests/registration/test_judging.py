@@ -8,6 +8,7 @@ import torch
 
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import Pipeline
+from curvireg_torch.registration import stages
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import judged
 from tests._support import CAMERA, SIZE, double, eye
@@ -174,3 +175,17 @@ def test_a_cut_object_is_doubtful_and_warned_of():
     assert result.warnings[:2] == ("of the photograph", "of the mesh")
     assert "outside the photograph" in result.warnings[2]
     assert result.notes == ("note",)
+
+
+def test_views_of_merged_poses_are_needed_where_one_pose_is_left():
+    """Of photograph 0 two are, of 1 one and the one outside the limits, of 2 one that others
+    repeat."""
+    poses = poses_at(*[0.0] * 9)
+    flags = {
+        "photograph": torch.tensor([0, 0, 0, 1, 1, 1, 2, 2, 2]),
+        "is_distinct": torch.tensor([1, 1, 0, 1, 0, 1, 1, 0, 0]).bool(),
+        "is_outside": torch.tensor([0, 0, 0, 0, 0, 1, 0, 0, 0]).bool(),
+    }
+    starts = replace(poses, is_repeated=torch.arange(9) == 8)
+    needed = stages._needed(replace(poses, **flags), starts)
+    assert needed.nonzero()[:, 0].tolist() == [0, 1, 3, 4, 5, 6, 7]
