@@ -91,11 +91,9 @@ class QueryFeatures:
     def __getitem__(self, index: Tensor | slice) -> "QueryFeatures":
         """Some of the photographs."""
         known = {field.name: getattr(self, field.name) for field in fields(QueryFeatures)}
-        computed = known.pop("computed")
-        return QueryFeatures(
-            **{name: None if x is None else x[index] for name, x in known.items()},
-            computed={name: x[index] for name, x in computed.items()},
-        )
+        computed = {name: x[index] for name, x in known.pop("computed").items()}
+        some: dict[str, Any] = {name: None if x is None else x[index] for name, x in known.items()}
+        return QueryFeatures(**some, computed=computed)
 
     def split(self) -> "list[QueryFeatures]":
         """Each photograph by itself."""
