@@ -303,7 +303,7 @@ def register(
         poses, rivals, feature_is_hidden = with_siblings(target, block, block.crops, poses)
         poses = _with_texture(target, block, block.crops, poses)
     poses = _merged(target, block, poses)
-    needed = _needed(poses, begun).nonzero()[:, 0]
+    needed = _needed(block, poses, begun).nonzero()[:, 0]
     poses = _with_views_again(target, block, poses[needed], begun[needed])
     if block.crops is not None:
         block, poses = with_focal_deviation(target, block, block.crops, poses)
@@ -516,13 +516,13 @@ def _merged(target: Target, block: Block, poses: Hypotheses) -> Hypotheses:
     return replace(poses, is_distinct=is_distinct)
 
 
-def _needed(poses: Hypotheses, starts: Hypotheses) -> Tensor:
+def _needed(block: Block, poses: Hypotheses, starts: Hypotheses) -> Tensor:
     """(N,) bool: the poses that did not merge with a better one; where one alone is left of a
     photograph, also those that merged with it, whose views tell how clear it is. Repeated starts
     were near it."""
-    counted = (poses.is_distinct & ~poses.is_outside).long()
-    left = torch.zeros(int(poses.photograph.max()) + 1, dtype=torch.long)
-    is_alone = left.index_add(0, poses.photograph, counted)[poses.photograph] <= 1
+    is_left = poses.is_distinct & ~poses.is_outside
+    left = torch.bincount(poses.photograph[is_left], minlength=len(block))
+    is_alone = (left <= 1)[poses.photograph]
     return poses.is_distinct | (is_alone & ~starts.is_repeated)
 
 

@@ -187,5 +187,5 @@ def test_views_of_merged_poses_are_needed_where_one_pose_is_left():
         "is_outside": torch.tensor([0, 0, 0, 0, 0, 1, 0, 0, 0]).bool(),
     }
     starts = replace(poses, is_repeated=torch.arange(9) == 8)
-    needed = stages._needed(replace(poses, **flags), starts)
+    needed = stages._needed(range(3), replace(poses, **flags), starts)
     assert needed.nonzero()[:, 0].tolist() == [0, 1, 3, 4, 5, 6, 7]
