@@ -357,8 +357,8 @@ UNKNOWN = torch.tensor([ASPECT, FOCAL_LENGTH], dtype=torch.float64)  # powers th
 
 DOUBTFUL_ASPECT = 0.014
 """Standard deviation of log fx / fy at the fitted pose from which it is fitted: contours of
-stretched photographs lie beside edges, by which it rises to more than that in all that are
-named. Half of the others stay below."""
+stretched photographs lie beside edges, which raises it to at least 0.016 in the 44 generated ones
+that are named; of 44 others 26 have less than 0.014."""
 
 WITHIN_REACH = 2.0 * CLEAR_DEVIATION
 """Standard deviation up to which, at the fitted pose, a focal length is worth a fit to contours. A
