@@ -438,17 +438,11 @@ class Rig:
         parts = []
         ranks = self.ranks(T)
         for v, photograph in enumerate(self.photographs):
-            R, distance = self.allocentric(photograph, T)
             cameras = photograph.photograph.K.expand(len(T), 3, 3)
             view = torch.zeros(len(T), dtype=torch.long)
-            poses = replace(
-                Hypotheses.at(
-                    photograph.camera @ T, cameras, self.describer.centre, view, ranks[v]
-                ),
-                rotation=R,
-                distance=distance,
-                edge_support=support[v],
-            )
+            seen = photograph.camera @ T
+            poses = Hypotheses.at(seen, cameras, self.describer.centre, view, ranks[v])
+            poses = replace(poses, edge_support=support[v])
             evidence = evidence_of(self.target, photograph, poses)
             parts.append(replace(evidence, details=self.details(photograph, T)))
         return Evidence.stack(parts)
