@@ -204,6 +204,7 @@ def test_flipped_photographs_are_described_as_they_look(bank, matcher):
     query = matcher.query(images, boxes)
     flipped, ranking = matcher.flipped(query)
     assert torch.equal(flipped.crops, query.crops.flip(-1))
+    assert torch.equal(flipped.points, query.points.flip(-1))
     assert torch.equal(flipped.field[:, 0], -query.field[:, 0].flip(-1))
     assert torch.equal(flipped.field[:, 1], query.field[:, 1].flip(-1))
     again = matcher.descriptor(flipped.field)
@@ -211,3 +212,10 @@ def test_flipped_photographs_are_described_as_they_look(bank, matcher):
     known = bank.descriptors[5].expand_as(flipped.descriptors)
     likeness = torch.cosine_similarity(flipped.descriptors, known, dim=2)
     assert_close(ranking.hog[:, 5], likeness.amax(dim=1), rtol=0, atol=1e-5)
+
+
+def test_described_photographs_are_split_with_what_terms_have_computed(matcher):
+    query = matcher.query(*batch(0, 1))
+    query.computed["of a term"] = torch.tensor([3.0, 4.0])
+    assert [one.computed["of a term"].tolist() for one in query.split()] == [[3.0], [4.0]]
+    assert torch.equal(query[torch.tensor([1])].points, query.points[1:])

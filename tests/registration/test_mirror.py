@@ -106,3 +106,7 @@ def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
     *known, best = given[1]
     alone = mirror_image.mirror_gain(*known, best[[1]])
     assert alone.tolist() == pytest.approx([float(wrong)], abs=0.05)
+    monkeypatch.setattr(mirror_image, "LESS_ALIKE", 0.0)
+    right, wrong = mirror_image.mirror_gain(*given[1])
+    assert right == -torch.inf
+    assert wrong > 1.0
