@@ -168,8 +168,9 @@ def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: Size) -> tuple[Tensor, Te
     """(N, 4) boxes in px around a mesh with ``hull`` (V, 3) at poses (N, 4, 4), in an image of
     ``size`` (H, W). And (N,) bool, False where the mesh lies behind the camera, or outside the
     image: there the box means nothing."""
-    depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
-    boxes = boxes_of(hull.to(T), T, K)
+    hull = hull.to(T)
+    depth = (hull @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
+    boxes = boxes_of(hull, T, K)
     limits = torch.tensor([size[1], size[0]], dtype=boxes.dtype) - 0.5
     outside = (boxes[:, :2] >= limits) | (boxes[:, 2:] <= -0.5) | (depth <= 0)[:, None]
     return boxes, ~outside.any(dim=1)

@@ -67,16 +67,15 @@ def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     its ``best`` pose, by shape alone; minus infinity where no view of it is as much alike, or has
     as much edge support after a short fit."""
     highest = torch.full((len(best),), -torch.inf, dtype=torch.float64)
-    own = [block.rankings[p] for p in best.photograph.tolist()]
     query, ranking = target.matcher.flipped(block.query[best.photograph])
-    rankings = ranking.split()
-    likeness = torch.cat([ranking.hog.amax(dim=1) for ranking in rankings])
-    own_likeness = torch.cat([ranking.hog.amax(dim=1) for ranking in own])
-    alike = (likeness - own_likeness > -LESS_ALIKE).nonzero()[:, 0]
+    likeness = ranking.hog.amax(dim=1).cpu()
+    own = torch.cat([block.rankings[p].hog.amax(dim=1) for p in best.photograph.tolist()])
+    alike = (likeness - own > -LESS_ALIKE).nonzero()[:, 0]
     if not len(alike):
         return highest
     some = best[alike]
-    rankings = [rankings[row] for row in alike.tolist()]
+    each = ranking.split()
+    rankings = [each[row] for row in alike.tolist()]
     seen, flipped_crops = _in_a_mirror(target, block, some, query[alike], rankings)
     places = list(range(len(some)))
     counts = [TRIED_VIEWS] * len(some)

@@ -519,7 +519,7 @@ def _merged(target: Target, block: Block, poses: Hypotheses) -> Hypotheses:
 def _needed(block: Block, poses: Hypotheses, starts: Hypotheses) -> Tensor:
     """(N,) bool: the poses that did not merge with a better one; where one alone is left of a
     photograph, also those that merged with it, whose views tell how clear it is. Repeated starts
-    were near it."""
+    do not: they began near it."""
     is_left = poses.is_distinct & ~poses.is_outside
     left = torch.bincount(poses.photograph[is_left], minlength=len(block))
     is_alone = (left <= 1)[poses.photograph]

@@ -12,7 +12,7 @@ has one photograph, or one for each of --cameras, or --frames of a moving camera
 fraction of the object outside the photograph. To calibrate confidence, --cad annotates an object as
 another one: similar, of its kind; wrong, any other; print, a package of the same shape with another
 print; mirrored, a tied shape's mirror image; variant, the shape with one part folded, moved, left
-out, or of another size. Scene i depends only on the seed and i; an interrupted
+out, or of another size. Scene i depends only on the seed, --models and i; an interrupted
 run can be resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette inside the picture,
 ``bbox_visib`` of its visible part. OUT/benchmark.json holds the options, and the group of each
 object for scripts/calibration.

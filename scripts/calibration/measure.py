@@ -258,8 +258,8 @@ def request_of(kind: str, pose: str, samples: Sequence[Row]) -> str:
     code."""
     chosen = set_of(kind)
     first = samples[0]
-    is_of = [chosen.photographs, chosen.model, is_grey(kind, first["obj_id"])]
+    shown = [chosen.photographs, chosen.model, is_grey(kind, first["obj_id"])]
     code = [results_digest(), Path(__file__).read_text(encoding="utf-8")]
-    seen = [(s["scene_id"], s["obj_id"], file_digest(Path(s["image_path"]))) for s in samples]
+    pictures = [(s["scene_id"], s["obj_id"], file_digest(Path(s["image_path"]))) for s in samples]
     mesh = mesh_digest(Path(first["model_path"]))
-    return text_digest(json.dumps([kind, pose, is_of, code, mesh, seen]))
+    return text_digest(json.dumps([kind, pose, shown, code, mesh, pictures]))

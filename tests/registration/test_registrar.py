@@ -399,6 +399,7 @@ def test_hypotheses_that_merge_are_left_out_unless_one_alone_is_left(fitted, som
         is_moved = [float(degrees) > 0.01 for degrees in moves]
         assert is_moved[0]
         assert is_moved == sorted(is_moved, reverse=True)
+        assert result.hypotheses[0].covariance is not None
         put_back = result.hypotheses[is_moved.count(True) :]
         assert all(h.covariance is None for h in put_back)
         counts.append(len(result.hypotheses))
