@@ -8,13 +8,13 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.special import expit, logsumexp
 from sklearn.metrics import roc_auc_score
 
-from curvireg_torch.registration import judging
 from curvireg_torch.registration.confidence import (
     DOUBT_FEATURES,
     EVIDENCE_FEATURES,
     RELIABLE,
     LogisticModel,
 )
+from curvireg_torch.registration.mirror_image import MIRROR_DOUBT
 from scripts.calibration.measure import RIGHT, Row
 from scripts.calibration.sets import SETS
 
@@ -125,7 +125,7 @@ def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
 def first_probability(row: Row, constants: Row) -> float:
     """Confidence of a row."""
     any_right = LogisticModel(constants["weights"], constants["bias"])(row["features"])
-    doubt = judging.MIRROR_DOUBT if row.get("mirror") else 1.0
+    doubt = MIRROR_DOUBT if row.get("mirror") else 1.0
     return doubt * any_right * first_share(row, constants)
 
 

@@ -22,8 +22,9 @@ from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
 from curvireg_torch.mesh import Mesh
-from curvireg_torch.registration import Follower, judging
+from curvireg_torch.registration import Follower
 from curvireg_torch.registration.confidence import are_near
+from curvireg_torch.registration.mirror_image import MIRROR_WARNING
 from curvireg_torch.utils.files import file_digest, text_digest
 from scripts._shared import measured, read_json
 from scripts.calibration.sets import photographs_of, set_of
@@ -105,7 +106,7 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
         "features": dict(result.confidence_features),
         "scores": scores[is_rival].tolist(),
         "errors": errors[is_rival].tolist(),
-        "mirror": judging.MIRROR_WARNING in result.warnings,
+        "mirror": MIRROR_WARNING in result.warnings,
     }
     is_unique = len(S) == 1  # else the covariance is that of another pose
     if best.covariance is not None and is_unique and errors[0] < RIGHT:

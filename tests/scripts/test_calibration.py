@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 pytest.importorskip("sklearn")
 
 from curvireg_torch.geometry.framing import outside_fraction
+from curvireg_torch.registration.mirror_image import MIRROR_DOUBT
 from curvireg_torch.synthetic import example_mesh
 from scripts.benchmark.make import TWIN, Packages, Shapes, Tied
 from scripts.calibration import fits, measure, sets
@@ -153,6 +154,33 @@ def test_level_of_few_rows_keeps_the_proportions_of_the_weights():
     assert fitted["weights"]["b"] == pytest.approx(-0.5, abs=0.08)
     assert fitted["bias"] == pytest.approx(0.25 - 1.0, abs=0.15)
     assert (fitted["slope"], fitted["resolution"]) == (1.5, 0.5)
+
+
+def test_registrations_that_fit_worse_than_the_mirror_image_are_doubted():
+    rng = np.random.default_rng(0)
+    rows = []
+    for k in range(120):
+        known = float(rng.normal())
+        is_right = known + 0.3 * rng.normal() > 0.0
+        rows.append(
+            {
+                "group": f"group {k % 12}",
+                "set": "mirrored" if k % 10 == 0 else "shapes",
+                "grey": k % 3 == 0,
+                "mirror": k % 10 == 0,
+                "features": {"known": known},
+                "scores": [2.0, 1.0],
+                "errors": [5.0, 90.0] if is_right else [90.0, 120.0],
+            }
+        )
+    constants, quality = fits.fit_registrations(rows, exact=True)
+    assert constants["n"] == 108, "of a mirrored one the fit learns nothing"
+    assert quality["sets"]["shapes"]["auc"] > 0.9
+    assert quality["sets"]["mirrored"]["right"] == 0.0, "the photographs do not show the mesh"
+    plain = rows[1] | {"mirror": False}
+    doubted = rows[1] | {"mirror": True}
+    probability = fits.first_probability(plain, constants)
+    assert fits.first_probability(doubted, constants) == pytest.approx(MIRROR_DOUBT * probability)
 
 
 def test_grey_meshes_have_no_colours(tmp_path):
