@@ -1,28 +1,26 @@
-"""Helpers that several scripts use: options, records, tables and timing."""
+"""Helpers that several scripts use: options, records, tables, and rows that are resumed."""
 
 import argparse
 import datetime
 import json
 import os
 import subprocess
-import sys
-import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tqdm import tqdm
 
 from curvireg_torch.errors import WorkerError
+from curvireg_torch.formats.meshes.files import mesh_digest
+from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.utils.executors import Workers
-from curvireg_torch.utils.files import write_file
-
-if TYPE_CHECKING:
-    import resource
+from curvireg_torch.utils.files import file_digest, text_digest, write_file
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RESULTS = REPOSITORY / "scripts" / "results"
+RIGHT_DEG = 30.0  # a pose is right whose rotation is within it
 WRITTEN = ("scripts/results", "docs", "README.md")
 """Paths that scripts write to. A change there does not affect what a script measures."""
 
@@ -53,7 +51,7 @@ def markdown_table(rows: Sequence[Sequence[object]]) -> str:
 
 
 def read_json(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
+    return json.loads(path.read_bytes())
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -64,7 +62,7 @@ def write_json(path: Path, content: Any) -> None:
 
 def read_lines(path: Path) -> list[Any]:
     """JSON lines."""
-    return list(map(json.loads, path.read_text(encoding="utf-8").splitlines()))
+    return [json.loads(line) for line in path.read_bytes().splitlines()]
 
 
 def in_processes(
@@ -106,6 +104,18 @@ def measured(
             file.write(json.dumps({"task": key, "rows": rows}) + "\n")
             file.flush()
     return [row for key in tasks for row in known[key]]
+
+
+def request_digest(
+    request: Sequence[Any],
+    scripts: Iterable[Path],
+    mesh: str | Path,
+    pictures: Iterable[str | Path],
+) -> str:
+    """Digest of all that the rows of a mesh and photographs depend on, code included."""
+    code = [results_digest(), *map(file_digest, scripts)]
+    photographs = [file_digest(Path(picture)) for picture in pictures]
+    return text_digest(json.dumps([request, code, mesh_digest(Path(mesh)), photographs]))
 
 
 def _of_item(function: Callable[[Any], Any], item: tuple[str, Any]) -> Any:
@@ -154,30 +164,3 @@ def processor(device: str = "cpu") -> str:
     lines = info.read_text().splitlines() if info.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return f"{names[0] if names else 'unknown processor'}, {os.cpu_count()} cores"
-
-
-def run_process(
-    words: Sequence[str], folder: Path, environment: dict[str, str]
-) -> "tuple[float, resource.struct_rusage, str]":
-    """Seconds, resources and output of a Python process in a folder; the script ends if the process
-    fails. On Windows, which does not count resources, an AttributeError.
-
-    Args:
-        words: arguments of the interpreter.
-    """
-    start = time.perf_counter()
-    with (folder / "output").open("w+") as output, (folder / "errors").open("w+") as errors:
-        process = subprocess.Popen(
-            [sys.executable, *words], env=environment, stdout=output, stderr=errors, cwd=folder
-        )
-        _, status, usage = os.wait4(process.pid, 0)
-        seconds = time.perf_counter() - start
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            errors.seek(0)
-            raise SystemExit(
-                f"{' '.join(words)} failed with PYTHONPATH={environment['PYTHONPATH']}: "
-                f"{errors.read()}"
-            )
-        output.seek(0)
-        return seconds, usage, output.read()

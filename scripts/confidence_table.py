@@ -8,7 +8,6 @@ the errors. Their rows replace those of the same sets in scripts/results/confide
 table is written from it.
 """
 
-import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -16,9 +15,12 @@ from typing import Any
 
 from sklearn.metrics import roc_auc_score
 
+from curvireg_torch.evaluation import DATASETS
+from curvireg_torch.evaluation.compare import read_run
 from scripts._shared import (
     REPOSITORY,
     RESULTS,
+    RIGHT_DEG,
     markdown_table,
     parser_of,
     read_json,
@@ -28,8 +30,6 @@ from scripts._shared import (
     write_json,
 )
 
-RIGHT = 30.0  # degrees
-ERROR_COLUMNS = ("rotation", "symmetric_error_deg")  # of BOP sets and of PASCAL3D+
 GENERATED = read_json(Path(__file__).with_name("tables.json"))["generated"]
 """By the name of their set in scripts/calibration: what photographs show."""
 
@@ -63,12 +63,12 @@ def measured(run: Path) -> dict[str, Any]:
     """What the confidences of one run are worth; objects without a pose count as wrong, with
     confidence 0."""
     results = {row["key"]: row for row in read_lines(run / "results.jsonl")}
-    with (run / "errors.csv").open(encoding="utf-8", newline="") as file:
-        errors = list(csv.DictReader(file))
-    column = next(name for name in ERROR_COLUMNS if name in errors[0])
-    found = [results[row["key"]] for row in errors]
+    evaluated = read_run(run)
+    errors = evaluated.errors
+    scored = DATASETS[evaluated.dataset].scored.page_error
+    found = [results[key] for key in errors]
     confidences = [result.get("confidence") or 0.0 for result in found]
-    right = [float(row[column] or "inf") < RIGHT for row in errors]
+    right = [row[scored] < RIGHT_DEG for row in errors.values()]
     trusted = [
         is_right for is_right, result in zip(right, found, strict=True) if result.get("reliable")
     ]
@@ -80,7 +80,7 @@ def measured(run: Path) -> dict[str, Any]:
         "reliable": len(trusted),
         "reliable_right": sum(trusted),
         "ambiguous": sum(result.get("ambiguous") is not None for result in found),
-        "auc": float(roc_auc_score(right, confidences)) if len(set(right)) == 2 else None,
+        "auc": roc_auc_score(right, confidences) if len(set(right)) == 2 else None,
     }
 
 

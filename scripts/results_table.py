@@ -20,6 +20,7 @@ from typing import Any
 from scripts._shared import (
     REPOSITORY,
     RESULTS,
+    RIGHT_DEG,
     markdown_table,
     parser_of,
     read_json,
@@ -38,8 +39,6 @@ WORDS = SHOWN["words"]
 
 LIGHTINGS = SHOWN["lightings"]
 """Of sets with several lightings of a view: their number; objects are not independent."""
-
-RIGHT = 30.0  # degrees
 
 
 def main() -> None:
@@ -132,14 +131,14 @@ def video_row(videos: Sequence[Mapping[str, Any]]) -> list[object]:
     errors = [error for video in videos for error in video["errors_deg"]]
     verdicts = [verdict for video in videos for verdict in video["verdicts"]]
     trusted = [e for e, verdict in zip(errors, verdicts, strict=True) if verdict == "reliable"]
-    right = sum(error < RIGHT for error in errors) / len(errors)
+    right = sum(error < RIGHT_DEG for error in errors) / len(errors)
     return [
         f"Frames of {len(videos)} videos, each followed from its first frame",
         len(errors),
         percent(right),
         degrees(median(errors)),
         len(trusted),
-        sum(error < RIGHT for error in trusted),
+        sum(error < RIGHT_DEG for error in trusted),
     ]
 
 

@@ -40,12 +40,11 @@ from scripts.scenes.families import FAMILIES, random_shape
 from scripts.scenes.materials import random_texture
 from scripts.scenes.packages import package
 from scripts.scenes.scene import SIZE, Scene, View, camera_path, cut, shelf, simulate_camera, single
-from scripts.scenes.surfaces import Array, Rng
+from scripts.scenes.surfaces import Array, Rng, middle_of
 from scripts.scenes.textured import Placed, TexturedMesh, plain_texture
 from scripts.scenes.tied import FAMILIES as TIED_FAMILIES
 from scripts.scenes.tied import tied_shape
 
-KINDS = ("printed", "shelf", "furniture", "shapes", "tied")
 CADS = ("exact", "similar", "wrong", "print", "mirrored", "variant")
 # fraction of the surface that has the same material after a symmetry of the appearance
 SAME_LOOK = 0.97
@@ -94,7 +93,7 @@ class Packages:
         raise SystemExit("--cad similar: printed packages have no kinds; take --kind furniture")
 
     def clutter(self, rng: Rng) -> TexturedMesh:
-        return self.mesh(int(rng.choice(self.ids)))
+        return self.mesh(rng.choice(self.ids))
 
     def texture(self, rng: Rng) -> Array:
         """Of walls and floors."""
@@ -111,7 +110,7 @@ class Shapes(Packages):
     def mesh(self, obj_id: int) -> TexturedMesh:
         rng = self.rng(3, obj_id)
         vertices, faces, materials = random_shape(rng, self.group(obj_id))
-        paints = [plain_texture(rng) for _ in range(int(materials.max()) + 1)]
+        paints = [plain_texture(rng) for _ in range(materials.max() + 1)]
         size = np.exp(rng.uniform(np.log(0.05), np.log(1.0)))
         mesh = TexturedMesh.from_arrays(size * vertices, faces, paints, paint=materials)
         return mesh.recoloured(paints[0]) if rng.random() < 0.5 else mesh
@@ -166,11 +165,11 @@ class Variants(Shapes):
         or 0.5 to 1.6 times as large."""
         rng = self.rng(5, obj_id)
         parts = self._parts(obj_id % TWIN)
-        part = parts[int(rng.integers(len(parts)))]
+        part = parts[rng.integers(len(parts))]
         change = rng.choice(["folded", "moved", "left out", "another size"])
         if change == "left out":
-            rows = {name: getattr(mesh, name)[~part] for name in ("triangles", "normals", "uv")}
-            return replace(mesh, **rows, paint=mesh.paint[~part], hull=None)
+            columns = ("triangles", "normals", "uv", "paint")
+            return replace(mesh, **{name: getattr(mesh, name)[~part] for name in columns})
         axis = rng.normal(size=3)
         axis /= np.linalg.norm(axis)
         turn = np.eye(3)
@@ -183,16 +182,16 @@ class Variants(Shapes):
         else:
             smaller = rng.uniform(0.5, 0.75)
             larger = rng.uniform(1.3, 1.6)
-            turn = turn * float(rng.choice([smaller, larger]))
+            turn = turn * rng.choice([smaller, larger])
         own = mesh.triangles[part]
         rest = mesh.triangles[~part].reshape(-1, 3)
         points = own.reshape(-1, 3)
-        joint = points[int(cKDTree(rest).query(points)[0].argmin())]  # where the part is attached
+        joint = points[cKDTree(rest).query(points)[0].argmin()]  # where the part is attached
         triangles = mesh.triangles.copy()
         triangles[part] = (own - joint) @ turn.T + joint + shift
         normals = mesh.normals.copy()
         normals[part] = normals[part] @ turn.T
-        return replace(mesh, triangles=triangles, normals=normals, hull=None)
+        return replace(mesh, triangles=triangles, normals=normals)
 
 
 class Tied(Shapes):
@@ -267,7 +266,7 @@ class Furniture(Packages):
         own = self._proportions(obj_id)
         gaps = {}
         for other in self._siblings(obj_id):
-            gaps[other] = float(np.exp(np.abs(own - self._proportions(other)).max()))
+            gaps[other] = np.exp(np.abs(own - self._proportions(other)).max())
         limit = max(MAX_PROPORTION, min(gaps.values()))
         return int(rng.choice([k for k, gap in gaps.items() if gap <= limit]))
 
@@ -289,6 +288,15 @@ class Furniture(Packages):
         return (picture / 255.0).astype(np.float32) ** 2.2
 
 
+KINDS = {
+    "printed": Packages,
+    "shelf": Packages,
+    "furniture": Furniture,
+    "shapes": Shapes,
+    "tied": Tied,
+}
+
+
 def model_row(objects: Packages, folder: Path, obj_id: int) -> dict[str, Any]:
     """Write the model of an object, a PLY file in mm with one texture, unless it exists; its row of
     models_info."""
@@ -298,10 +306,10 @@ def model_row(objects: Packages, folder: Path, obj_id: int) -> dict[str, Any]:
         mesh.save_ply(path)
     low = 1000.0 * mesh.hull.min(axis=0)
     size = 1000.0 * mesh.hull.max(axis=0) - low
-    row = {"diameter": 1000.0 * float(pdist(mesh.hull).max())}
+    row = {"diameter": 1000.0 * pdist(mesh.hull).max()}
     for k, axis in enumerate("xyz"):
-        row[f"min_{axis}"] = float(low[k])
-        row[f"size_{axis}"] = float(size[k])
+        row[f"min_{axis}"] = low[k]
+        row[f"size_{axis}"] = size[k]
     discrete = []
     for S in objects.symmetries(obj_id)[1:]:
         T = np.eye(4)
@@ -331,14 +339,14 @@ def compose(
         scene, annotated = lone_object(objects, options, index, attempt, rng)
     if options.frames > 1:
         points = np.concatenate([shape.hull for shape in scene.annotated])
-        middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        scene = replace(scene, views=camera_path(scene.views[0], middle, options.frames, rng))
+        views = camera_path(scene.views[0], middle_of(points), options.frames, rng)
+        scene = replace(scene, views=views)
     return scene, annotated
 
 
 def full_shelf(objects: Packages, options: Namespace, rng: Rng) -> tuple[Scene, Annotated]:
     low, high = options.objects
-    count = min(int(rng.integers(low, high + 1)), len(objects.ids))
+    count = min(rng.integers(low, high + 1), len(objects.ids))
     chosen = rng.choice(objects.ids, count, replace=False).tolist()
     annotated = {k: (k, objects.mesh(k)) for k in chosen}
     scene = shelf(
@@ -371,7 +379,7 @@ def lone_object(
         objects.texture,
         rng,
         upright=index % 2 == 0,
-        occluded=bool(rng.random() < 0.3 and attempt < 12),
+        occluded=rng.random() < 0.3 and attempt < 12,
         cameras=options.cameras,
     )
     named = shown
@@ -383,7 +391,7 @@ def lone_object(
         own = objects.group(shown)
         named = int(rng.choice([k for k in objects.ids if objects.group(k) != own]))
     if options.cut:
-        fraction = float(rng.uniform(*options.cut))
+        fraction = rng.uniform(*options.cut)
         hull = scene.shapes[0].hull
         views = [cut(view, hull, fraction, rng) for view in scene.views]
         scene = replace(scene, views=views)
@@ -473,11 +481,8 @@ def info_row(seen: Array, whole: Array) -> dict[str, Any]:
 def _box(mask: Array) -> list[int]:
     """BOP's x, y, width, height in px between the centres of the outermost pixels; -1 four times
     for none."""
-    if not mask.any():
-        return [-1, -1, -1, -1]
-    y0, y1 = np.flatnonzero(mask.any(axis=1))[[0, -1]].tolist()
-    x0, x1 = np.flatnonzero(mask.any(axis=0))[[0, -1]].tolist()
-    return [x0, y0, x1 - x0, y1 - y0]
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    return [x, y, width - 1, height - 1] if width else [-1, -1, -1, -1]
 
 
 def write_targets(options: Namespace) -> int:
@@ -536,9 +541,8 @@ def arguments() -> ArgumentParser:
 
 def main() -> None:
     options = arguments().parse_args()
-    shapes = Variants if options.cad == "variant" else Shapes
-    kinds = {"furniture": Furniture, "shapes": shapes, "tied": Tied}
-    objects = kinds.get(options.kind, Packages)(options)
+    kind = Variants if options.cad == "variant" else KINDS[options.kind]
+    objects = kind(options)
     (options.out / "test").mkdir(parents=True, exist_ok=True)
     models = options.out / "models"
     models.mkdir(exist_ok=True)

@@ -13,9 +13,9 @@ the objects, by a hash of their names.
 
 import hashlib
 import re
+import shutil
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -64,8 +64,7 @@ def fetch(out: Path, deb: Path | None) -> Path:
         unpacked.mkdir(parents=True, exist_ok=True)
         subprocess.run(["dpkg-deb", "-x", deb.resolve(), unpacked], check=True)
         for archive in unpacked.rglob("*.sh3f"):
-            with zipfile.ZipFile(archive) as file:
-                file.extractall(unpacked / archive.stem)
+            shutil.unpack_archive(archive, unpacked / archive.stem, "zip")
         (unpacked / "done").touch()
     return unpacked
 
@@ -133,7 +132,7 @@ def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
         written.append(line)
     for other in source.parent.iterdir():
         if other.is_file() and other.suffix.lower() != ".obj":
-            (folder / other.name).write_bytes(other.read_bytes())
+            shutil.copyfile(other, folder / other.name)
     # renamed when complete, so that an interrupted run can be resumed
     part = folder / "model.obj.part"
     part.write_text("\n".join(written) + "\n", encoding="latin1")

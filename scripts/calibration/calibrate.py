@@ -61,12 +61,12 @@ def covariance_quality(distances: ArrayLike, scale: float) -> Row:
     poses to the truth: shares within the ellipsoids of 50 % and 90 %, and the ``covariance_scale``
     with which 90 % would lie within the latter."""
     distances = np.asarray(distances)
-    within = {f"{level:.0%}": float((distances < chi2.ppf(level, 6)).mean()) for level in LEVELS}
-    wanted = scale * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
+    within = {f"{level:.0%}": (distances < chi2.ppf(level, 6)).mean() for level in LEVELS}
+    wanted = scale * np.quantile(distances, 0.9) / chi2.ppf(0.9, 6)
     return {
         "covariances": len(distances),
         "within": within,
-        "covariance_scale": round(wanted, 3),
+        "covariance_scale": round(float(wanted), 3),
     }
 
 

@@ -1,6 +1,7 @@
 """Fits of confidences to measured rows, and how well they tell what is right."""
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from curvireg_torch.registration.confidence import (
     LogisticModel,
 )
 from curvireg_torch.registration.mirror_image import MIRROR_DOUBT
-from scripts.calibration.measure import RIGHT, Row
+from scripts._shared import RIGHT_DEG
+from scripts.calibration.measure import Row
 from scripts.calibration.sets import SETS
 
 FOLDS = 5
@@ -53,7 +55,7 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
         w = p[:-1]
         logit = Z @ w + p[-1]
         losses = np.logaddexp(0.0, logit) - y * logit
-        value = float(weight @ losses) + 0.5 * float(w @ w)
+        value = weight @ losses + 0.5 * (w @ w)
         slope = weight * (expit(logit) - y)
         return value, np.append(Z.T @ slope + w, slope.sum())
 
@@ -80,7 +82,7 @@ def fit_level(rows: Sequence[Row], weight: np.ndarray, constants: Row) -> Row:
         scale, level = p
         confidence = np.clip(expit(scale * logit + level) * share, 1e-9, 1.0 - 1e-9)
         said = np.where(first, confidence, 1.0 - confidence)
-        return float(-weight @ np.log(said))
+        return -weight @ np.log(said)
 
     scale, level = minimize(loss, np.array([1.0, 0.0]), method="Nelder-Mead").x
     weights = {name: round(float(scale) * value, 4) for name, value in constants["weights"].items()}
@@ -92,27 +94,27 @@ def row_logit(row: Row, constants: Row) -> float:
     """Logit of the probability that any hypothesis of a row is right."""
     features = row["features"]
     terms = [weight * (features[name] or 0.0) for name, weight in constants["weights"].items()]
-    return float(constants["bias"] + sum(terms))
+    return constants["bias"] + sum(terms)
 
 
 def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
     """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some
     pose is right and some are not; without ``ties`` the resolution is 0."""
-    decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT]
-    chosen = [rows[k] for k in decided]
-    most = max((len(row["scores"]) for row in chosen), default=1)
-    behind = np.full((len(chosen), most), np.inf)
-    right = np.zeros((len(chosen), most), bool)
-    for place, row in enumerate(chosen):
-        scores = np.array(row["scores"])
-        behind[place, : len(scores)] = scores.max() - scores
-        right[place, : len(scores)] = np.array(row["errors"]) < RIGHT
+    decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT_DEG]
+
+    def filled(name: str, value: float) -> np.ndarray:
+        columns = zip_longest(*(rows[k][name] for k in decided), fillvalue=value)
+        return np.array(list(columns)).T
+
+    scores = filled("scores", -np.inf)
+    behind = scores.max(axis=1, keepdims=True) - scores
+    right = filled("errors", np.inf) < RIGHT_DEG
 
     def loss(slope: float, resolution: float) -> float:
         logits = -slope * np.maximum(0.0, behind - resolution)
         of_right = np.where(right, logits, -np.inf)
         losses = logsumexp(logits, axis=1) - logsumexp(of_right, axis=1)
-        return float(weight[decided] @ losses + 0.05 * slope**2)
+        return weight[decided] @ losses + 0.05 * slope**2
 
     found = []
     for resolution in RESOLUTIONS if ties else (0.0,):
@@ -133,7 +135,7 @@ def first_share(row: Row, constants: Row) -> float:
     """Share of the first hypothesis in the probability that any is right."""
     scores = np.array(row["scores"])
     logits = -constants["slope"] * np.maximum(0.0, scores.max() - scores - constants["resolution"])
-    return float(np.exp(logits[0] - logsumexp(logits)))
+    return np.exp(logits[0] - logsumexp(logits))
 
 
 def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
@@ -141,7 +143,7 @@ def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
     sure = p >= RELIABLE
 
     def mean(values: np.ndarray, chosen: Any = slice(None)) -> float:
-        return float(np.average(values[chosen], weights=weight[chosen]))
+        return np.average(values[chosen], weights=weight[chosen])
 
     both = len(np.unique(right)) == 2
     return {
@@ -149,7 +151,7 @@ def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
         "right": mean(right),
         "said": mean(p),
         "reliable": mean(sure),
-        "auc": float(roc_auc_score(right, p, sample_weight=weight)) if both else None,
+        "auc": roc_auc_score(right, p, sample_weight=weight) if both else None,
         "right if reliable": mean(right, sure) if sure.any() else None,
         "reliable and wrong": int((sure & ~right).sum()),
     }
@@ -157,8 +159,8 @@ def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
 
 def errors_within(errors: np.ndarray) -> Row:
     """Fractions of errors (n,) in degrees within 5 and 15, and their median."""
-    within = {f"within {limit}": float((errors < limit).mean()) for limit in (5, 15)}
-    return within | {"median": float(np.median(errors))}
+    within = {f"within {limit}": (errors < limit).mean() for limit in (5, 15)}
+    return within | {"median": np.median(errors)}
 
 
 def weights_of(sets: np.ndarray) -> np.ndarray:
@@ -166,7 +168,7 @@ def weights_of(sets: np.ndarray) -> np.ndarray:
     photographs."""
     weight = np.ones(len(sets))
     assumed = {name: SETS[name].share for name in np.unique(sets) if SETS[name].share}
-    ordinary = float((~np.isin(sets, list(assumed))).sum())
+    ordinary = (~np.isin(sets, list(assumed))).sum()
     factor = ordinary / (1.0 - sum(assumed.values()))
     for name, share in assumed.items():
         weight[sets == name] = factor * share / (sets == name).sum()
@@ -178,8 +180,8 @@ def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
     set."""
     for row in rows:
         is_present = not SETS[row["set"]].absent
-        row["right"] = is_present and min(row["errors"]) < RIGHT
-        row["first"] = is_present and row["errors"][0] < RIGHT
+        row["right"] = is_present and min(row["errors"]) < RIGHT_DEG
+        row["first"] = is_present and row["errors"][0] < RIGHT_DEG
     sets = np.array([row["set"] for row in rows])
     weight = weights_of(sets)
     signs = dict.fromkeys(EVIDENCE_FEATURES, 1.0) | dict.fromkeys(DOUBT_FEATURES, -1.0)

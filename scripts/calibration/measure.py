@@ -1,7 +1,6 @@
 """What registrations, refinements, trackers and detections say of generated photographs, and
 whether it is true: a row for each."""
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
@@ -15,23 +14,27 @@ from torch import Tensor
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import LostObjectError
+from curvireg_torch.evaluation.metrics import symmetric_rotation_error
 from curvireg_torch.evidence import Evidence
-from curvireg_torch.formats.meshes.files import mesh_digest
-from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
+from curvireg_torch.geometry import (
+    axis_angle_from_rotation,
+    rotation_from_axis_angle,
+    rotation_towards,
+    symmetry_transforms,
+    transform,
+)
+from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.geometry.crops import box_iou
-from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
 from curvireg_torch.mesh import Mesh
 from curvireg_torch.registration import Follower
 from curvireg_torch.registration.confidence import are_near
 from curvireg_torch.registration.mirror_image import MIRROR_WARNING
-from curvireg_torch.utils.files import file_digest, text_digest
-from scripts._shared import measured, read_json
+from scripts._shared import RIGHT_DEG, measured, read_json, request_digest
 from scripts.calibration.sets import photographs_of, set_of
 
 Row: TypeAlias = dict[str, Any]
 
-RIGHT = 30.0  # degrees within which a registration is right
 # and fraction of the distance, within which a refined or tracked pose is right
 FINE_DEGREES = 10.0
 FINE_FRACTION = 0.1
@@ -53,25 +56,23 @@ def symmetries_of(sample: Row, registrar: cr.Registrar | None = None) -> Tensor:
     """(S, 3, 3) rotations after which the object counts as the same: those of the set, and those
     that an exact mesh without colours has for the registrar, unless a notable feature of it tells
     them apart."""
-    listed = sample["model_info"].get("symmetries_discrete", [])
-    known = [torch.eye(4).double()[None], torch.tensor(listed).double().view(-1, 4, 4)]
+    known = symmetry_transforms(sample["model_info"])
     if registrar is not None and not registrar.telling_symmetries.notable:
         found = registrar.symmetries_of(exact=True)
         if found is not None:
-            known.append(found.double())
-    return torch.cat(known)[:, :3, :3]
+            known = torch.cat([known, found.double()])
+    return known[:, :3, :3]
 
 
 def errors_of(R: Tensor, sample: Row, S: Tensor | None = None) -> Tensor:
     """(N,) degrees between rotations (N, 3, 3) and the truth, up to symmetries ``S`` (S, 3, 3)."""
     S = symmetries_of(sample) if S is None else S
-    truths = sample["rotation"].double() @ S
-    return cr.rotation_error(R[:, None].double(), truths[None]).amin(dim=1)
+    return symmetric_rotation_error(R.double(), sample["rotation"].double(), S)
 
 
 def truth_of(sample: Row) -> Tensor:
     """(4, 4) true pose of a sample."""
-    return cr.geometry.transform(sample["rotation"].double(), sample["translation"].double())
+    return transform(sample["rotation"].double(), sample["translation"].double())
 
 
 def fine(T: Tensor, sample: Row) -> bool:
@@ -93,7 +94,7 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
         R = torch.stack([h.rotation for h in result.hypotheses])
     else:  # compare as seen by a camera that looks straight at the object
         R = torch.stack([h.allocentric_rotation for h in result.hypotheses])
-        straight = cr.geometry.rotation_towards(true_centre(sample))
+        straight = rotation_towards(true_centre(sample))
         seen = sample | {"rotation": straight.T @ sample["rotation"].double()}
     evidence = Evidence.of_hypotheses([h.evidence for h in result.hypotheses])
     scores = evidence.scores(registrar.score_weights(exact=registrar.is_exact))
@@ -109,7 +110,7 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
         "mirror": MIRROR_WARNING in result.warnings,
     }
     is_unique = len(S) == 1  # else the covariance is that of another pose
-    if best.covariance is not None and is_unique and errors[0] < RIGHT:
+    if best.covariance is not None and is_unique and errors[0] < RIGHT_DEG:
         turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
         e = torch.cat([turn, sample["translation"].double() - best.translation])
         row["distance2"] = float(e @ torch.linalg.solve(best.covariance.double(), e))
@@ -120,8 +121,7 @@ def true_centre(sample: Row) -> Tensor:
     """(3,) middle of the model's box at the true pose, in mm."""
     info = sample["model_info"]
     middle = [info[f"min_{c}"] + 0.5 * info[f"size_{c}"] for c in "xyz"]
-    centre = sample["rotation"].double() @ torch.tensor(middle, dtype=torch.float64)
-    return centre + sample["translation"].double()
+    return point_in_cameras(truth_of(sample), torch.tensor(middle, dtype=torch.float64))
 
 
 def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
@@ -134,9 +134,7 @@ def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
         vector = torch.randn(3, generator=generator, dtype=torch.float64)
         turn = rotation_from_axis_angle(np.radians(degrees) * vector / vector.norm())
         sign = 1.0 if torch.rand((), generator=generator) < 0.5 else -1.0
-        start = T.clone()
-        start[:3, :3] = turn @ T[:3, :3]
-        start[:3, 3] *= 1.0 + sign * fraction
+        start = transform(turn @ T[:3, :3], T[:3, 3] * (1.0 + sign * fraction))
         absent = degrees == fraction == 0.0
         result = registrar.refine([(other if absent else sample)["image"]], K, [start])[0]
         if result.ok:
@@ -260,7 +258,7 @@ def request_of(kind: str, pose: str, samples: Sequence[Row]) -> str:
     chosen = set_of(kind)
     first = samples[0]
     shown = [chosen.photographs, chosen.model, is_grey(kind, first["obj_id"])]
-    code = [results_digest(), Path(__file__).read_text(encoding="utf-8")]
-    pictures = [(s["scene_id"], s["obj_id"], file_digest(Path(s["image_path"]))) for s in samples]
-    mesh = mesh_digest(Path(first["model_path"]))
-    return text_digest(json.dumps([kind, pose, shown, code, mesh, pictures]))
+    objects = [(s["scene_id"], s["obj_id"]) for s in samples]
+    pictures = [s["image_path"] for s in samples]
+    what = [kind, pose, shown, objects]
+    return request_digest(what, [Path(__file__)], first["model_path"], pictures)

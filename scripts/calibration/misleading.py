@@ -38,15 +38,17 @@ from torch import Tensor
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.registration.confidence import RELIABLE
-from scripts._shared import RESULTS, measured, parser_of, read_json, stamp, write_json
-from scripts.benchmark.make import TWIN, Variants
-from scripts.calibration.measure import (
-    Row,
-    errors_of,
-    mesh_of,
-    symmetries_of,
-    true_centre,
+from scripts._shared import (
+    RESULTS,
+    RIGHT_DEG,
+    measured,
+    parser_of,
+    read_json,
+    stamp,
+    write_json,
 )
+from scripts.benchmark.make import TWIN, Variants
+from scripts.calibration.measure import Row, errors_of, mesh_of, symmetries_of, true_centre
 from scripts.calibration.sets import SETS
 
 SOURCES = {name: each.misleads for name, each in SETS.items() if each.misleads}
@@ -62,7 +64,6 @@ STRETCH = 1.25
 BARREL = (-0.3, 0.08, 0.0, 0.0)  # k1, k2, p1, p2 of OpenCV
 LARGER = 1.25
 CROPPED = 0.62  # of both sides
-WRONG_DEGREES = 30.0
 WRONG_DISTANCE = 0.15
 
 
@@ -166,7 +167,7 @@ def answer_of(
         "distance": distance,
         "mesh_is_right": mesh_is_right,
         "axis_is_right": axis_is_right(result, registrar, turn),
-        "wrong": degrees > WRONG_DEGREES or not mesh_is_right or is_far,
+        "wrong": degrees > RIGHT_DEG or not mesh_is_right or is_far,
     }
 
 
@@ -178,8 +179,8 @@ def axis_is_right(result: cr.Registration, registrar: cr.Registrar, turn: Tensor
     cosine = float(turn @ result.axis.direction @ result.axis.direction)
     if registrar.round_axis.ends_are_alike:
         cosine = abs(cosine)
-    degrees = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    return degrees <= result.axis.tolerance_deg
+    degrees = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return bool(degrees <= result.axis.tolerance_deg)
 
 
 def measure(task: tuple[Path, list[str], list[int]]) -> list[Row]:

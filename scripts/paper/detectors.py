@@ -1,11 +1,9 @@
 """The 2D detectors that the paper compares.
 
-``DETECTORS[name](image, fraction)`` takes (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W)
-RGB, and returns the feature points, (B, 1, H, W) bool: at most the fraction of the pixels except
-for ties.
+``DETECTORS[name](image, fraction)`` takes (1, 1, H, W) grey levels in [0, 1] and returns the
+feature points, (1, 1, H, W) bool: at most the fraction of the pixels except for ties.
 """
 
-import functools
 from collections.abc import Callable
 from typing import TypeAlias
 
@@ -27,27 +25,9 @@ from curvireg_torch.filters import (
     multiscale_focus_curves,
     principal_curvature_image,
 )
-from curvireg_torch.filters.operations import (
-    at_least_float32,
-    central_derivatives,
-    image_maximum,
-    smooth,
-    to_grey,
-)
-
-__all__ = ["DETECTORS"]
+from curvireg_torch.filters.operations import central_derivatives, image_maximum, smooth
 
 Detector: TypeAlias = Callable[[Tensor, float], Tensor]
-
-
-def detector(function: Detector) -> Detector:
-    """Decorator that lets a detector on grey levels accept RGB and half types."""
-
-    @functools.wraps(function)
-    def on_photograph(image: Tensor, fraction: float) -> Tensor:
-        return function(to_grey(at_least_float32(image)), fraction)
-
-    return on_photograph
 
 
 def peaks(response: Tensor, fraction: float) -> Tensor:
@@ -57,13 +37,11 @@ def peaks(response: Tensor, fraction: float) -> Tensor:
     return strongest_points(response, largest & (response > 0), fraction)
 
 
-@detector
 def sobel(image: Tensor, fraction: float) -> Tensor:
     """Gradient by the Sobel kernels per px (their sums divided by 8), borders replicated."""
     return field_points(spatial_gradient(image)[:, 0], fraction=fraction)
 
 
-@detector
 def laplacian_of_gaussian(image: Tensor, fraction: float) -> Tensor:
     """Zero crossings of the Laplacian of the image smoothed by 2 px (Marr and Hildreth 1980).
 
@@ -81,24 +59,18 @@ def laplacian_of_gaussian(image: Tensor, fraction: float) -> Tensor:
     return strongest_points(response, response > 0, fraction)
 
 
-@detector
 def canny(image: Tensor, fraction: float) -> Tensor:
     """Canny (1986) by scikit-image, sigma 1.4 px; as in MATLAB's ``edge``, 30 % of the pixels
     exceed the upper threshold, and the lower one is 0.4 times as high."""
     gradient = spatial_gradient(smooth(image, 1.4, margin=0))[:, 0]
     response = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
-    points = torch.zeros_like(response, dtype=torch.bool)
-    for grey, length, mask in zip(
-        image.double().numpy()[:, 0], response[:, 0], points[:, 0], strict=True
-    ):
-        # scikit-image divides its Sobel sums by 4
-        high = 4.0 * float(np.quantile(length.numpy(), 0.7))
-        edges = skimage.feature.canny(grey, 1.4, 0.4 * high, high, mode="nearest")
-        mask.copy_(torch.from_numpy(edges))
-    return strongest_points(response, points, fraction)
+    # scikit-image divides its Sobel sums by 4
+    high = 4.0 * float(np.quantile(response.numpy(), 0.7))
+    grey = image[0, 0].double().numpy()
+    edges = skimage.feature.canny(grey, 1.4, 0.4 * high, high, mode="nearest")
+    return strongest_points(response, torch.from_numpy(edges)[None, None], fraction)
 
 
-@detector
 def fuzzy_edges(image: Tensor, fraction: float) -> Tensor:
     r"""Edges by fuzzy rules on the two derivatives, each divided by the largest derivative of the
     image.
@@ -122,7 +94,6 @@ SIDES = (9, 15, 21, 27, 39, 51, 75, 99)
 1.2 px."""
 
 
-@detector
 def fast_hessian(image: Tensor, fraction: float) -> Tensor:
     """Fast-Hessian (Bay et al. 2008), the detector of SURF: determinants of a Hessian of box
     filters by scikit-image.
@@ -131,9 +102,9 @@ def fast_hessian(image: Tensor, fraction: float) -> Tensor:
     """
     H, W = image.shape[-2:]
     sides = [side for side in SIDES if side <= max(21, H, W)]
-    greys = F.pad(image.double(), (50,) * 4, mode="replicate").numpy()[:, 0]
-    found = [[skimage.feature.hessian_matrix_det(x, side / 3) for side in sides] for x in greys]
-    volume = torch.tensor(np.array(found), dtype=torch.float32)[:, None]
+    grey = F.pad(image.double(), (50,) * 4, mode="replicate")[0, 0].numpy()
+    found = [skimage.feature.hessian_matrix_det(grey, side / 3) for side in sides]
+    volume = torch.tensor(np.array(found), dtype=torch.float32)[None, None]
     # scikit-image's result is one pixel too far up and left
     volume = volume[..., 49 : 49 + H, 49 : 49 + W]
     inner = volume[:, :, 1:-1]
@@ -142,39 +113,35 @@ def fast_hessian(image: Tensor, fraction: float) -> Tensor:
     return strongest_points(best, best > 0, fraction)
 
 
-@detector
 def harris(image: Tensor, fraction: float) -> Tensor:
     """Harris and Stephens (1988): det - 0.04 trace^2 of the structure tensor (Sobel, Gaussian
     window), where positive."""
     return peaks(harris_response(image, k=0.04), fraction)
 
 
-@detector
 def minimum_eigenvalue(image: Tensor, fraction: float) -> Tensor:
     """Shi and Tomasi (1994): the smaller eigenvalue of the structure tensor (Sobel, Gaussian
     window)."""
     return peaks(gftt_response(image), fraction)
 
 
-@detector
 def sift(image: Tensor, fraction: float) -> Tensor:
     """SIFT keypoints (Lowe 2004) by OpenCV with its defaults on the CPU, each rounded to the
     nearest pixel."""
     points = torch.zeros(image.shape, dtype=torch.bool)
     H, W = image.shape[-2:]
-    sift_detector = cv2.SIFT.create(nfeatures=max(1, int(fraction * H * W)))
-    greys = (255.0 * image[:, 0].clamp(0.0, 1.0)).round().byte()
-    for mask, grey in zip(points[:, 0], greys, strict=True):
-        for keypoint in sift_detector.detect(grey.numpy(), None):
-            x = min(max(round(keypoint.pt[0]), 0), W - 1)
-            y = min(max(round(keypoint.pt[1]), 0), H - 1)
-            mask[y, x] |= keypoint.response > 0
+    found = cv2.SIFT.create(nfeatures=max(1, int(fraction * H * W)))
+    grey = (255.0 * image[0, 0].clamp(0.0, 1.0)).round().byte()
+    for keypoint in found.detect(grey.numpy(), None):
+        x = min(max(round(keypoint.pt[0]), 0), W - 1)
+        y = min(max(round(keypoint.pt[1]), 0), H - 1)
+        points[0, 0, y, x] |= keypoint.response > 0
     return points
 
 
 def of_field(field: Callable[[Tensor], Tensor]) -> Detector:
     """The detector of a filter of the library."""
-    return detector(lambda image, fraction: field_points(field(image), fraction=fraction))
+    return lambda image, fraction: field_points(field(image), fraction=fraction)
 
 
 DETECTORS: dict[str, Detector] = {

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from kornia.color import rgb_to_grayscale
+from skimage.metrics import hausdorff_distance
 from torch import Tensor, nn
 
 from curvireg_torch.features import field_points
@@ -30,9 +31,10 @@ from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.matching.search import BEST_VIEWS, coherent_of, different_views, refine, search
 from curvireg_torch.mesh import Mesh, load_mesh
 from curvireg_torch.pipeline import FIELDS, PRESETS, BankSettings, Pipeline, ViewPolicy
+from scripts._shared import RIGHT_DEG
 from scripts.paper.cases import Case
 from scripts.paper.detectors import DETECTORS
-from scripts.paper.measures import hausdorff_distance, share_near
+from scripts.paper.measures import share_near
 from scripts.paper.tables import (
     CURVE_OFFSETS,
     PAIRS,
@@ -40,7 +42,6 @@ from scripts.paper.tables import (
     RANKS,
     REFINED_PAIRS,
     REPEATED_DEPTHS,
-    RIGHT_DEG,
     SEARCHED_PAIRS,
 )
 
@@ -48,8 +49,9 @@ Record = dict[str, Any]
 
 CURVE_DETECTORS = ("MFC", "MCS", "IG", "SIFT", "SOBEL")
 SENSITIVE = ("MFC", "MCS", "IG", "SOBEL", "CANNY")
-EPS = (1.0, 2.0, 3.0, 4.0)
-SHARES = (0.01, 0.02, 0.04, 0.08)
+EPS_OF_SHARES = {0.01: (2.0,), 0.02: (2.0,), 0.04: (1.0, 2.0, 3.0, 4.0), 0.08: (2.0,)}
+"""Radii in px, of each share of the pixels that are points: one of the two is usual."""
+
 BEST_PAIR = "CS/MFC"
 KNOWN_AZIMUTH_DEG = 45.0
 THRESHOLDS = (0.001, PAPER_THRESHOLD, 0.01, 0.03, 0.06, 0.1)
@@ -124,7 +126,9 @@ def _points_of(
     circle = field_points(around, fraction=share)[:, 0]
     record = {
         "ip": {name: share_near(photo, view) for name, photo in photos.items()},
-        "hausdorff": {name: hausdorff_distance(photo, view) for name, photo in photos.items()},
+        "hausdorff": {
+            name: hausdorff_distance(photo.numpy(), view.numpy()) for name, photo in photos.items()
+        },
         "points": {name: int(photo.sum()) for name, photo in photos.items()},
         "repeatability": {
             f"{depth}/{name}": share_near(points, photos[name])
@@ -138,11 +142,11 @@ def _points_of(
         "threshold": {},
     }
     record["ip"]["chance"] = share_near(torch.ones_like(view), view)
-    for share in SHARES:
+    for share, radii in EPS_OF_SHARES.items():
         few = field_points(fields["CS"], fraction=share)[0, 0]
         found = detected(crop, share)
         for name in SENSITIVE:
-            for eps in EPS:
+            for eps in radii:
                 key = f"{name} {share:g} {eps:g}"
                 record["sensitivity"][key] = share_near(found[name], few, eps_px=eps)
     for threshold in THRESHOLDS:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
-from scipy.spatial.distance import directed_hausdorff
 from torch import Tensor
 
 RESAMPLES = 2000
@@ -59,13 +58,3 @@ def share_near(points: Tensor, others: Tensor, *, eps_px: float = 2.0) -> float:
         return 0.0
     distances = distance_transform_edt(~others.numpy())
     return float((distances[chosen] <= eps_px).mean())
-
-
-def hausdorff_distance(a: Tensor, b: Tensor) -> float:
-    """Hausdorff distance of two sets of points (H, W) in px: the largest distance of a point of
-    either to the other set; ``inf`` where one set is empty and NaN where both are."""
-    x = a.nonzero()
-    y = b.nonzero()
-    if not len(x) or not len(y):
-        return math.inf if len(x) or len(y) else math.nan
-    return max(directed_hausdorff(x, y)[0], directed_hausdorff(y, x)[0])

@@ -6,9 +6,10 @@ each pair errors of elevation, azimuth, yaw and distance, estimated and closest.
 and table have their names in PASCAL3D+.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean
+
+import numpy as np
 
 from scripts._shared import read_json
 
@@ -17,27 +18,21 @@ TABLES = read_json(Path(__file__).with_suffix(".json"))
 DETECTORS = TABLES["detectors"]
 
 
-def _named(row: Sequence[float], names: Sequence[str], unit: float = 1.0) -> dict[str, float]:
-    return {name: unit * value for name, value in zip(names, row, strict=True)}
-
-
-def _means(
-    rows: Iterable[Sequence[float]], names: Sequence[str], unit: float = 1.0
-) -> dict[str, float]:
+def _means(rows: Sequence[Sequence[float]], names: Sequence[str], unit: float) -> dict[str, float]:
     """Of each column."""
-    columns = zip(*rows, strict=True)
-    return _named([fmean(column) for column in columns], names, unit)
+    return dict(zip(names, unit * np.mean(rows, axis=0), strict=True))
 
 
-IP = _means(TABLES["ip"].values(), DETECTORS, 0.01)
+IP = _means(list(TABLES["ip"].values()), DETECTORS, 0.01)
 WEB_IP = _means(TABLES["web_ip"], DETECTORS, 0.01)
-HAUSDORFF = _means(TABLES["hausdorff"].values(), DETECTORS)
-WEB_HAUSDORFF = _means(TABLES["web_hausdorff"], DETECTORS)
-PRECISION = _means(TABLES["precision"].values(), PAIRS)
+HAUSDORFF = _means(list(TABLES["hausdorff"].values()), DETECTORS, 1.0)
+WEB_HAUSDORFF = _means(TABLES["web_hausdorff"], DETECTORS, 1.0)
+PRECISION = _means(list(TABLES["precision"].values()), PAIRS, 1.0)
 """Means over the classes that the paper prints; of the web collection, over its objects."""
 
-IP_BY_CLASS = {name: _named(row, DETECTORS, 0.01) for name, row in TABLES["ip"].items()}
-PRECISION_BY_CLASS = {name: _named(row, PAIRS) for name, row in TABLES["precision"].items()}
+IP_BY_CLASS = {name: _means([row], DETECTORS, 0.01) for name, row in TABLES["ip"].items()}
+PRECISION_BY_CLASS = {name: _means([row], PAIRS, 1.0) for name, row in TABLES["precision"].items()}
 """What the paper prints for each class."""
+
 
 POSE_ERRORS = TABLES["pose_errors"]

@@ -27,7 +27,6 @@ with the commit, into a page.
 """
 
 import argparse
-import json
 import shutil
 import sys
 import time
@@ -42,10 +41,16 @@ sys.path.insert(0, str(REPOSITORY))
 
 from curvireg_torch.errors import CurviregError, MissingDependencyError
 from curvireg_torch.evaluation import DATASETS
-from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.pipeline import BankSettings
-from curvireg_torch.utils.files import file_digest, text_digest, write_file
-from scripts._shared import commit, measured, parser_of, read_lines, update_page
+from curvireg_torch.utils.files import write_file
+from scripts._shared import (
+    commit,
+    measured,
+    parser_of,
+    read_lines,
+    request_digest,
+    update_page,
+)
 from scripts.paper import tables as paper
 from scripts.paper.cases import Case, by_mesh, find_cases
 
@@ -73,6 +78,7 @@ ON_PAGE += ("precision_classes", "ranks", "grids", "angles", "search")
 BLOCKS = {"protocols": ("protocols", "thresholds"), "paper": ON_PAGE}
 """Tables between each pair of markers of the page; one that a folder has none of stays."""
 
+MEASURED_BY = ("cases", "detectors", "measure", "measures")
 RECORDS = "records.jsonl"
 CURVE = "paper-curve.webp"
 
@@ -128,15 +134,9 @@ def request_of(
     group: list[Case],
 ) -> str:
     """Digest of all that the records of a mesh depend on."""
-    own = [
-        Path(__file__).with_name(name).read_text(encoding="utf-8")
-        for name in ("cases.py", "detectors.py", "measure.py", "measures.py")
-    ]
-    code = results_digest() + text_digest("".join(own))
-    names = (group[0].mesh_path, *(case.image_path for case in group))
-    files = [file_digest(Path(name)) for name in names]
-    keys = [case.key for case in group]
-    return text_digest(json.dumps([phase, str(settings), pose, code, files, keys]))
+    own = [Path(__file__).with_name(f"{name}.py") for name in MEASURED_BY]
+    what = [phase, str(settings), pose, *(case.key for case in group)]
+    return request_digest(what, own, group[0].mesh_path, [case.image_path for case in group])
 
 
 def check_packages() -> None:

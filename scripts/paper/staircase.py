@@ -28,10 +28,9 @@ from curvireg_torch.evaluation.compare import read_run
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.terms import Appearance, BoxShape
 from curvireg_torch.utils.executors import Workers
-from scripts._shared import commit, markdown_table, parser_of, update_page
+from scripts._shared import RIGHT_DEG, commit, markdown_table, parser_of, update_page
 from scripts.paper.measures import Estimate, bootstrap
 
-RIGHT_DEG = 30.0
 FEWEST_CADS = 3  # for an interval
 
 

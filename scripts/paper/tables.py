@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from curvireg_torch.filters.focus import PAPER_THRESHOLD
-from scripts._shared import markdown_table
+from scripts._shared import RIGHT_DEG, markdown_table
 from scripts.paper import printed
 from scripts.paper.measures import Estimate, bootstrap
 
@@ -23,7 +23,6 @@ SEARCHED_PAIRS = PAIRS[:3]
 REFINED_PAIRS = PAIRS[:2]
 RANKS = (1, 3, 5, 10, 20)
 GRIDS = (4, 8, 16)
-RIGHT_DEG = 30.0
 NAMES = {"literal": "literal", "printed": "corrected, S_hog as printed", "corrected": "corrected"}
 VARIANTS = tuple(NAMES)
 CLASS_DETECTORS = ("MFC", "MCS", "PCI", "SOBEL", "CANNY")
@@ -200,12 +199,10 @@ def curve_tables(records: Records) -> list[Table]:
 def sensitivity_tables(records: Records) -> list[Table]:
     """IP for other radii and numbers of points."""
     keys = [key.split() for key in records.records[0]["sensitivity"]]
-    names = list(dict.fromkeys(key[0] for key in keys))
-    settings = sorted({(float(key[1]), float(key[2])) for key in keys})
+    names = list(dict.fromkeys(name for name, _, _ in keys))
+    settings = sorted({(float(share), float(eps)) for _, share, eps in keys})
     rows = []
     for share, eps in settings:
-        if share != 0.04 and eps != 2.0:  # one of the two is usual
-            continue
         cells = [at("sensitivity", f"{name} {share:g} {eps:g}") for name in names]
         rows.append([f"{100 * share:g} %", f"{eps:g} px", *cells])
     for threshold in records.records[0]["threshold"]:

@@ -22,6 +22,7 @@ from scripts.scenes.surfaces import (
     superquadric,
     torus,
     unit_circle,
+    with_radius_1,
 )
 
 
@@ -40,13 +41,13 @@ def _piece(rng: Rng) -> Surface:
     if kind == 3:
         return disc(x, -y, y)
     if kind == 4:
-        n = int(rng.integers(3, 14))
+        n = rng.integers(3, 14)
         places = np.arange(n) + rng.uniform(-0.3, 0.3, n)
         corners = unit_circle(np.sort(2 * np.pi * places / n))
         return extrude(rng.uniform(0.4, 1, (n, 1)) * corners, z)
     if kind == 5:
         return torus(x, rng.uniform(0.1, 0.5) * x)
-    sides = int(rng.choice([4, 6, 12]))
+    sides = rng.choice([4, 6, 12])
     return bar((0, 0, -z), (0, 0, z), 0.1 + 0.2 * x, sides=sides)
 
 
@@ -55,11 +56,11 @@ def compound(rng: Rng) -> Parts:
     parts = Parts()
     centre = np.zeros(3)
     mirrored = rng.random() < 0.5
-    for k in range(int(rng.integers(2, 8))):
+    for k in range(rng.integers(2, 8)):
         if rng.random() < 0.3:
             R = random_rotation(rng)
         else:
-            axis = int(rng.integers(3))
+            axis = rng.integers(3)
             R = rotation(axis, 0.5 * np.pi * rng.integers(4))
         piece = _piece(rng).moved(centre, R, rng.uniform(0.3, 1.0))
         parts.add(piece, k)
@@ -73,7 +74,7 @@ def stack(rng: Rng) -> Parts:
     """Boxes side by side and on top of each other, like furniture, houses and machines."""
     parts = Parts()
     top = 0.0
-    for k in range(int(rng.integers(1, 5))):
+    for k in range(rng.integers(1, 5)):
         width = rng.uniform(0.3, 1.2)
         depth = rng.uniform(0.3, 1.2)
         height = rng.uniform(0.1, 0.8)
@@ -87,7 +88,7 @@ def stack(rng: Rng) -> Parts:
 def vessel(rng: Rng) -> Parts:
     """Bottles, jars, vases, lamps: surfaces of revolution, with a lid and at times a handle."""
     parts = Parts()
-    n = int(rng.integers(3, 7))
+    n = rng.integers(3, 7)
     heights = np.sort(rng.uniform(0, 1, n))
     radii = rng.uniform(0.1, 0.4, n)
     if rng.random() < 0.6:  # body, shoulder, neck
@@ -120,7 +121,7 @@ def chair(rng: Rng) -> Parts:
     seat = rounded_box(rng, (w, d, thick))
     parts.add(seat, 0, (0, 0, h))
     lean = rng.uniform(0, 0.15)
-    sides = int(rng.choice([4, 10]))
+    sides = rng.choice([4, 10])
     if rng.random() < 0.75:
         spread = rng.uniform(1.0, 1.25)
         for x, y in corners_of(0.5 * w - leg, 0.5 * d - leg):
@@ -170,11 +171,11 @@ def _add_back(
     is_ladder = rng.random() < 0.5
     if is_ladder:
         a, b = posts
-        places = np.linspace(0.3, 1, int(rng.integers(2, 6)))
+        places = np.linspace(0.3, 1, rng.integers(2, 6))
         radius = leg
     else:
         a, b = np.stack(posts, axis=1)
-        places = np.linspace(0.0, 1, int(rng.integers(3, 8)))
+        places = np.linspace(0.0, 1, rng.integers(3, 8))
         radius = 0.7 * leg
     for s in places:
         start = a[0] * (1 - s) + a[1] * s
@@ -206,7 +207,7 @@ def table(rng: Rng) -> Parts:
     parts.add(top, 0, (0, 0, h))
     if rng.random() < 0.7:
         for x, y in corners_of(0.5 * reach * w, 0.5 * reach * d):
-            sides = int(rng.choice([4, 10]))
+            sides = rng.choice([4, 10])
             parts.add(bar((x, y, 0), (x, y, h), leg, sides=sides), 1)
     else:
         parts.add(bar((0, 0, 0), (0, 0, h), 2 * leg), 1)
@@ -239,7 +240,7 @@ def sofa(rng: Rng) -> Parts:
         side = rounded_box(rng, (arm, d + deep, high))
         x = s * 0.5 * (w + arm)
         parts.add(side, 0, (x, 0.3 * deep, 0.5 * high + 0.05))
-    n = int(rng.integers(1, 4))
+    n = rng.integers(1, 4)
     for x in w * ((np.arange(n) + 0.5) / n - 0.5):
         seat = superquadric((0.48 * w / n, 0.45 * d, 0.08), (0.4, 0.3))
         parts.add(seat, 1, (x, -0.05, h + 0.08))
@@ -418,10 +419,8 @@ def random_shape(rng: Rng, family: str | None = None) -> tuple[Array, Array, Arr
     surface, materials = FAMILIES[family](rng).joined()
     points = surface.vertices * rng.uniform(0.8, 1.25, 3)
     if rng.random() < 0.3:  # taper and lean the whole
-        height = max(float(np.ptp(points[:, 2])), 1e-9)
+        height = max(np.ptp(points[:, 2]), 1e-9)
         z = (points[:, 2:] - points[:, 2].mean()) / height
         taper = 1 + rng.uniform(-0.3, 0.3) * z
         points[:, :2] = points[:, :2] * taper + rng.normal(0, 0.1, 2) * z
-    points = points - 0.5 * (points.min(axis=0) + points.max(axis=0))
-    radius = max(float(np.linalg.norm(points, axis=1).max()), 1e-9)
-    return points / radius, surface.faces, materials
+    return with_radius_1(points), surface.faces, materials

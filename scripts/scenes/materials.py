@@ -22,11 +22,11 @@ class Material:
         self._first = random_colour(rng)
         self._second = random_colour(rng)
         kinds = ("waves", "stripes", "checks", "cells", "print", "grain")
-        self._kind = "plain" if rng.random() < plain else str(rng.choice(kinds))
+        self._kind = "plain" if rng.random() < plain else rng.choice(kinds)
         axes = rng.normal(size=(3, 6))
         self._axes = axes * np.exp(rng.uniform(0.3, 2.5))
         self._phases = rng.uniform(0, 2 * np.pi, 6)
-        cells = int(rng.integers(4, 25))
+        cells = rng.integers(4, 25)
         self._seeds = rng.uniform(-1, 1, (cells, 3))
         self._palette = np.stack([random_colour(rng) for _ in self._seeds])
         self._strength = rng.uniform(0.1, 1.0)
@@ -90,7 +90,7 @@ def random_picture(rng: Rng, size: int) -> Array:
     elif kind in (3, 4):
         picture = np.ascontiguousarray(picture)
         most = 40 if kind == 3 else 120
-        for _ in range(int(rng.integers(3, most))):
+        for _ in range(rng.integers(3, most)):
             _draw_shape(picture, rng)
     return np.ascontiguousarray(np.clip(picture, 0, 1), dtype=np.float32)
 
@@ -105,8 +105,7 @@ def _draw_shape(picture: Array, rng: Rng) -> None:
         end = rng.integers(0, size, 2).tolist()
         cv2.line(picture, place, end, colour, int(rng.integers(1, 5)), cv2.LINE_AA)
     elif rng.random() < 0.5:
-        count = int(rng.integers(3, 6))
-        corners = np.array(place) + rng.normal(0, reach, (count, 2))
+        corners = place + rng.normal(0, reach, (rng.integers(3, 6), 2))
         hull = cv2.convexHull(corners.astype(np.int32))
         cv2.fillConvexPoly(picture, hull, colour, cv2.LINE_AA)
     else:
@@ -127,8 +126,8 @@ def random_texture(rng: Rng) -> Array:
     second = random_colour(rng)
     y, x = np.mgrid[0:size, 0:size] / size
     if kind == 1:  # cloth: threads above and below each other, in stripes or checks
-        threads = 2 * int(rng.integers(12, 32))
-        stripes = int(rng.integers(1, 6))
+        threads = 2 * rng.integers(12, 32)
+        stripes = rng.integers(1, 6)
         warp = np.sin(2 * np.pi * threads * x)
         weave = 0.5 + 0.5 * warp * np.sin(2 * np.pi * threads * y)
         bands = np.sin(2 * np.pi * stripes * x)

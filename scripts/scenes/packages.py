@@ -5,7 +5,7 @@ import numpy as np
 import trimesh
 
 from scripts.scenes.materials import random_colour, random_picture
-from scripts.scenes.surfaces import Rng
+from scripts.scenes.surfaces import Rng, raised
 from scripts.scenes.textured import Texture, TexturedMesh
 
 # size of a label in px
@@ -21,19 +21,18 @@ def label(rng: Rng) -> np.ndarray:
     """(HEIGHT, WIDTH, 3) uint8: bands, a picture, words and small print on one colour."""
     picture = np.full((HEIGHT, WIDTH, 3), 255 * random_colour(rng), np.float32)
     for _ in range(rng.integers(0, 4)):
-        top = int(rng.integers(HEIGHT))
+        top = rng.integers(HEIGHT)
         colour = 255 * random_colour(rng)
-        picture[top : top + int(rng.integers(5, 60))] = colour
+        picture[top : top + rng.integers(5, 60)] = colour
     for _ in range(rng.integers(2, 5)):
         side = int(rng.integers(50, 150))
-        x = int(rng.integers(WIDTH - side))
-        y = int(rng.integers(HEIGHT - side))
+        x = rng.integers(WIDTH - side)
+        y = rng.integers(HEIGHT - side)
         picture[y : y + side, x : x + side] = 255 * random_picture(rng, side)
     picture = picture.clip(0, 255).round().astype(np.uint8)
     for _ in range(rng.integers(5, 16)):
-        length = rng.integers(2, 9)
-        word = "".join(rng.choice(list(LETTERS), length))
-        scale = float(rng.uniform(0.4, 2.5))
+        word = "".join(rng.choice(list(LETTERS), rng.integers(2, 9)))
+        scale = rng.uniform(0.4, 2.5)
         x = int(rng.integers(WIDTH))
         y = int(rng.integers(20, HEIGHT))
         colour = (255 * random_colour(rng)).tolist()
@@ -47,39 +46,23 @@ def solid_of_revolution(rng: Rng) -> tuple[np.ndarray, ...]:
     """Vertices, faces and texture coordinates of a can, or of a bottle with shoulder and neck, of
     height 1."""
     radius = rng.uniform(0.18, 0.5)
-    if rng.random() < 0.5:
-        profile = [(0.0, 0.0), (radius, 0.0), (radius, 1.0), (0.0, 1.0)]
-    else:
+    wall = [(radius, 1.0)]
+    if rng.random() >= 0.5:
         shoulder = rng.uniform(0.5, 0.75)
         neck = radius * rng.uniform(0.25, 0.5)
         waist = (radius * rng.uniform(0.8, 1.0), 0.5 * shoulder)
-        profile = [
-            (0.0, 0.0),
-            (radius, 0.0),
-            waist,
-            (radius, shoulder),
-            (neck, 0.85),
-            (neck, 1.0),
-            (0.0, 1.0),
-        ]
-    steps = np.diff(np.array(profile), axis=0)
-    along = np.append(0.0, np.hypot(steps[:, 0], steps[:, 1]).cumsum())
+        wall = [waist, (radius, shoulder), (neck, 0.85), (neck, 1.0)]
+    radii, heights = np.array([(0.0, 0.0), (radius, 0.0), *wall, (0.0, 1.0)]).T
+    along = np.append(0.0, np.hypot(np.diff(radii), np.diff(heights)).cumsum())
     around = SIDES + 1  # the first side is also the last
     angle = np.linspace(0.0, 2.0 * np.pi, around)
     ring = np.stack([np.sin(angle), -np.cos(angle)], axis=1)
-    points = []
-    uv = []
-    faces = []
-    for level, (r, z) in enumerate(profile):
-        points.append(np.c_[r * ring, np.full(around, z)])
-        v = along[level] / along[-1]
-        uv.append(np.c_[angle / (2.0 * np.pi), np.full(around, v)])
-        if level:
-            b = level * around + np.arange(SIDES)
-            a = b - around
-            faces.append(np.c_[a, a + 1, b + 1])
-            faces.append(np.c_[a, b + 1, b])
-    return np.concatenate(points), np.concatenate(faces), np.concatenate(uv)
+    points = raised(radii[:, None, None] * ring, heights[:, None, None])
+    uv = np.stack(np.meshgrid(angle / (2.0 * np.pi), along / along[-1]), axis=-1)
+    a = np.arange(len(along) - 1)[:, None] * around + np.arange(SIDES)
+    b = a + around
+    faces = np.stack([a, a + 1, b + 1, a, b + 1, b], axis=-1).reshape(-1, SIDES, 2, 3)
+    return points.reshape(-1, 3), faces.swapaxes(1, 2).reshape(-1, 3), uv.reshape(-1, 2)
 
 
 def carton(rng: Rng) -> tuple[np.ndarray, ...]:

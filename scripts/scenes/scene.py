@@ -21,7 +21,7 @@ from curvireg_torch.geometry import (
 from curvireg_torch.geometry.framing import outside_fraction
 from scripts.scenes.light import Light, random_light
 from scripts.scenes.materials import random_picture, random_rotation
-from scripts.scenes.surfaces import Array, Rng, rotation, unit_circle
+from scripts.scenes.surfaces import Array, Rng, middle_of, rotation, unit_circle
 from scripts.scenes.textured import Picture, Placed, Texture, TexturedMesh, render
 
 Draw: TypeAlias = Callable[[Rng], TexturedMesh]
@@ -74,7 +74,7 @@ def single(
     fill = rng.uniform(0.25, 0.65) * min(SIZE)
     low = rng.uniform(-4, 25)
     high = rng.uniform(5, 60)
-    elevation = float(rng.choice([low, high]))
+    elevation = rng.choice([low, high])
     azimuth = rng.uniform(0, 360)
     view = look_at(hull, rng, fill=fill, azimuth=azimuth, elevation=elevation)
     R, t, _ = view
@@ -83,10 +83,10 @@ def single(
     if eye[2] > 0.05 and rng.random() < 0.9:
         towards_camera = eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9)
         shapes += _room(textures, towards_camera, rng)
-    reach = 0.8 * float(np.linalg.norm(hull[:, :2], axis=1).max())
-    count = int(rng.choice([0, 1, 3, 5]))
+    reach = 0.8 * np.linalg.norm(hull[:, :2], axis=1).max()
+    count = rng.choice([0, 1, 3, 5])
     shapes += _clutter(clutter, reach, eye, count, occluded, rng)
-    return _lit(shapes, view, target.hull, cameras, rng)
+    return _lit(shapes, view, hull, cameras, rng)
 
 
 def _lit(
@@ -112,7 +112,7 @@ def shelf(
 ) -> Scene:
     """Objects side by side on one or two boards, two deep: the front row hides up to ``occlusion``
     of the back row."""
-    unit = float(np.mean([mesh.radius for _, mesh in meshes]))
+    unit = np.mean([mesh.radius for _, mesh in meshes])
     boards = 1 if len(meshes) < 10 or rng.random() < 0.3 else 2
     share = np.array_split(rng.permutation(len(meshes)), boards)
     shapes = []
@@ -121,7 +121,7 @@ def shelf(
         edge = [0.0, 0.0]
         tallest = 0.0
         for n, k in enumerate(members):
-            obj_id, mesh = meshes[int(k)]
+            obj_id, mesh = meshes[k]
             row = n % 2  # front, back
             turn = rotation(2, np.radians(rng.normal(0, 35)))
             hull = Placed.standing(mesh, turn, 1.0 / unit).hull
@@ -176,10 +176,9 @@ def look_at(
     x, y = sides * (0.5 + free * rng.uniform(-1, 1, 2))
     ray = np.linalg.inv(K) @ (x, y, 1.0)
     ray /= np.linalg.norm(ray)
-    R = rotation_towards(torch.from_numpy(ray)).numpy()
-    R = R @ rotation_from_viewpoint(azimuth, elevation, rng.normal(0, 4)).numpy()
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    nearest = 1.25 * 0.5 * float(np.linalg.norm(np.ptp(points, axis=0)))
+    R = towards(ray) @ rotation_from_viewpoint(azimuth, elevation, rng.normal(0, 4)).numpy()
+    middle = middle_of(points)
+    nearest = 1.25 * 0.5 * np.linalg.norm(np.ptp(points, axis=0))
     distance = 4.0 * nearest
     for _ in range(12):
         placed = (points - middle) @ R.T + distance * ray
@@ -204,7 +203,7 @@ def cut(
     H, W = SIZE
     seen = (points @ R.T + t) @ K.T
     pixels = seen[:, :2] / seen[:, 2:]
-    middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
+    middle = middle_of(pixels)
     reach = np.ptp(pixels, axis=0)
     side = rng.choice([-1.0, 0.0, 1.0], 2)
     if not side.any():
@@ -217,7 +216,7 @@ def cut(
     for _ in range(20):
         part = 0.5 * (low + high)
         target = np.where(side == 0, middle, border + side * part * reach)
-        turn = _turn_to(to_ray @ (*middle, 1.0), to_ray @ (*target, 1.0))
+        turn = towards(to_ray @ (*target, 1.0)) @ towards(to_ray @ (*middle, 1.0)).T
         pose = transform(torch.from_numpy(turn @ R), torch.from_numpy(turn @ t))
         if outside_fraction(hull, pose, torch.from_numpy(K), SIZE) < fraction:
             low = part
@@ -226,11 +225,9 @@ def cut(
     return turn @ R, turn @ t, K
 
 
-def _turn_to(ray: Array, target: Array) -> Array:
-    """(3, 3) rotation from one ray to another."""
-    first = rotation_towards(torch.from_numpy(ray)).numpy()
-    second = rotation_towards(torch.from_numpy(target)).numpy()
-    return second @ first.T
+def towards(ray: Array) -> Array:
+    """(3, 3) rotation from the axis of a camera to a ray (3,)."""
+    return rotation_towards(torch.from_numpy(ray)).numpy()
 
 
 def _rig(
@@ -242,7 +239,7 @@ def _rig(
     """The view and others around it, which look at the middle of points (P, 3) from other
     azimuths."""
     R, t, K = view
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    middle = middle_of(points)
     views = [view]
     angle = np.zeros(2)
     for k in range(1, cameras):
@@ -311,11 +308,11 @@ def _quad(corners: list[tuple[float, ...]], paint: Texture, repeats: float = 1.0
 def _room(textures: Callable[[Rng], Array], toward: Array, rng: Rng) -> list[Placed]:
     """A floor and up to two walls on the far side; ``toward`` (2,) is the horizontal direction to
     the camera."""
-    r = float(rng.choice([3.0, 8.0, 40.0]))
+    r = rng.choice([3.0, 8.0, 40.0])
     floor = [(-r, -r, 0.0), (r, -r, 0.0), (r, r, 0.0), (-r, r, 0.0)]
     paint = Texture(textures(rng))
     surfaces = [_quad(floor, paint, r / rng.uniform(0.5, 3.0))]
-    for _ in range(int(rng.choice([0, 1, 1, 2]))):
+    for _ in range(rng.choice([0, 1, 1, 2])):
         back = -toward + rng.normal(0, 0.5, 2)
         back = back / np.linalg.norm(back)
         side = np.array([-back[1], back[0]])
@@ -343,13 +340,13 @@ def _clutter(
     for k in range(count + occluder):
         mesh = draw(rng)
         front = k >= count
-        size = float(np.exp(rng.uniform(-0.9, 0.4)))
+        size = np.exp(rng.uniform(-0.9, 0.4))
         scale = size * (0.6 if front else 1.0) / mesh.radius
         turn = _rotation(0.0, 0.0, rng.uniform(0, 360))
         if rng.random() < 0.15:
             turn = random_rotation(rng)
         width, depth, _ = np.ptp(mesh.hull, axis=0)
-        radius = 0.5 * scale * float(np.linalg.norm((width, depth)))
+        radius = 0.5 * scale * np.linalg.norm((width, depth))
         if front:
             x, y = eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9)
             aside = np.array([-y, x]) * rng.uniform(-0.8, 0.8)
@@ -383,7 +380,7 @@ def simulate_camera(picture: Array, rng: Rng) -> Array:
     if rng.random() < 0.5:
         picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 1.6))
     if rng.random() < 0.1:  # motion blur
-        length = int(rng.integers(3, 8))
+        length = rng.integers(3, 8)
         kernel = np.zeros((length, length), np.float32)
         end = rng.integers(0, length, 2).tolist()
         cv2.line(kernel, (length // 2, length // 2), end, 1.0)

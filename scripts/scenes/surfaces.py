@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import trimesh
 from numpy.typing import ArrayLike
 
 Array: TypeAlias = np.ndarray[Any, Any]
@@ -59,6 +60,17 @@ def rotation(axis: int, angle: float) -> Array:
     return R
 
 
+def middle_of(points: Array) -> Array:
+    """(D,) middle of the box around points (N, D)."""
+    return 0.5 * (points.min(axis=0) + points.max(axis=0))
+
+
+def with_radius_1(points: Array) -> Array:
+    """Points (N, 3), moved so that the middle of their box is the origin, and scaled."""
+    centred = points - middle_of(points)
+    return centred / max(np.linalg.norm(centred, axis=1).max(), 1e-9)
+
+
 def unit_circle(angles: Array) -> Array:
     """(N, 2) points at angles (N,) in radians."""
     return np.stack([np.cos(angles), np.sin(angles)], -1)
@@ -90,11 +102,17 @@ def _circle(n: int = AROUND) -> Array:
     return unit_circle(2 * np.pi * np.arange(n) / n)
 
 
+def raised(outlines: Array, heights: Array) -> Array:
+    """(M, N, 3) points of (M, N, 2) outlines at heights along z: (M, 1, 1) of outlines, (N, 1) of
+    their points."""
+    z = np.broadcast_to(heights, (*outlines.shape[:2], 1))
+    return np.concatenate([outlines, z], -1)
+
+
 def loft(outlines: Array, heights: ArrayLike) -> Surface:
     """Closed surface through (M, N, 2) outlines at (M,) heights along z."""
-    levels = np.asarray(heights, dtype=float)[:, None, None]
-    z = np.broadcast_to(levels, (*outlines.shape[:2], 1))
-    return grid(np.concatenate([outlines, z], -1))
+    levels = np.asarray(heights, dtype=float)
+    return grid(raised(outlines, levels[:, None, None]))
 
 
 def box(size: ArrayLike, *, top: float = 1.0) -> Surface:
@@ -136,9 +154,7 @@ def superquadric(size: ArrayLike, roundness: tuple[float, float]) -> Surface:
     v = np.linspace(-0.5, 0.5, AROUND // 2 + 1) * np.pi
     ring = _power(_circle(), roundness[1])
     level = _power(unit_circle(v), roundness[0])
-    flat = level[:, :1, None] * ring
-    height = np.broadcast_to(level[:, 1:, None], (len(v), AROUND, 1))
-    points = np.concatenate([flat, height], -1)
+    points = raised(level[:, :1, None] * ring, level[:, 1:, None])
     return grid(points, caps=False).moved(scale=size)
 
 
@@ -152,9 +168,7 @@ def torus(radius: float, thickness: float) -> Surface:
     around = np.concatenate([around, around[:1]])
     section = thickness * _circle(10)
     flat = around[:, None] * (radius + section[:, :1])
-    height = np.broadcast_to(section[:, 1:], (*flat.shape[:2], 1))
-    points = np.concatenate([flat, height], -1)
-    return grid(points, caps=False)
+    return grid(raised(flat, section[:, 1:]), caps=False)
 
 
 def bar(
@@ -167,9 +181,8 @@ def bar(
     """Straight rod between two points; ``sides=4`` makes it square."""
     a = np.asarray(start, dtype=float)
     b = np.asarray(end, dtype=float)
-    length = float(np.linalg.norm(b - a))
-    axis = (b - a) / max(length, 1e-9)
-    shortest = int(np.abs(axis).argmin())
+    axis = (b - a) / max(np.linalg.norm(b - a), 1e-9)
+    shortest = np.abs(axis).argmin()
     side = np.cross(axis, np.eye(3)[shortest])
     side /= np.linalg.norm(side)
     frame = np.stack([side, np.cross(axis, side)])
@@ -180,10 +193,5 @@ def bar(
 
 def join(surfaces: list[Surface]) -> Surface:
     """One surface of several."""
-    vertices = np.concatenate([surface.vertices for surface in surfaces])
-    faces = []
-    count = 0
-    for surface in surfaces:
-        faces.append(surface.faces + count)
-        count += len(surface.vertices)
-    return Surface(vertices, np.concatenate(faces))
+    vertices, faces = zip(*surfaces, strict=True)
+    return Surface(*trimesh.util.append_faces(vertices, faces))

@@ -1,7 +1,8 @@
 """Meshes with textures or solid patterns, and ray-traced pictures of them."""
 
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from scipy.spatial import ConvexHull
 from curvireg_torch.rendering.embree import RayScene
 from scripts.scenes.light import Light, shade_points
 from scripts.scenes.materials import random_colour
-from scripts.scenes.surfaces import Array, Rng
+from scripts.scenes.surfaces import Array, Rng, middle_of
 
 # px, longer side of textures: finer ones would only alias in pictures of this size
 MAX_TEXTURE = 512
@@ -77,15 +78,6 @@ class TexturedMesh:
     uv: Array
     paint: Array
     paints: tuple[Any, ...]
-    hull: Array = field(default=None)  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        if self.hull is None:
-            points = self.triangles.reshape(-1, 3)
-            tolerance = 1e-6 * np.abs(points).max()
-            if np.linalg.matrix_rank(points - points[0], tol=tolerance) == 3:
-                points = points[ConvexHull(points).vertices]
-            object.__setattr__(self, "hull", points)
 
     @classmethod
     def from_arrays(
@@ -101,8 +93,7 @@ class TexturedMesh:
         corners = np.asarray(vertices, float)[faces]
         normals = np.repeat(face_normals(corners)[:, None], 3, axis=1)
         uv = np.zeros((*faces.shape, 2)) if uv is None else np.asarray(uv)[faces]
-        if paint is None:
-            paint = np.zeros(len(faces), int)
+        paint = np.zeros(len(faces), int) if paint is None else paint
         return cls(corners, normals, uv, paint, tuple(paints))
 
     @classmethod
@@ -112,29 +103,48 @@ class TexturedMesh:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # faces without texture coordinates
             loaded = trimesh.load(path, process=False)
-        parts = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
-        parts = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-        counts = [len(part.faces) for part in parts]
-        columns = zip(*map(columns_of, parts), strict=True)
+        read = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
+        solids = [each for each in read if isinstance(each, trimesh.Trimesh) and len(each.faces)]
+        parts = [cls.of_part(solid) for solid in solids]
         return cls(
-            *map(np.concatenate, columns),
-            paint=np.repeat(np.arange(len(parts)), counts),
-            paints=tuple(map(paint_of, parts)),
+            np.concatenate([part.triangles for part in parts]),
+            np.concatenate([part.normals for part in parts]),
+            np.concatenate([part.uv for part in parts]),
+            np.repeat(np.arange(len(parts)), [len(part.paint) for part in parts]),
+            tuple(part.paints[0] for part in parts),
         )
+
+    @classmethod
+    def of_part(cls, part: trimesh.Trimesh) -> "TexturedMesh":
+        """A mesh of one material that trimesh has read."""
+        faces = np.asarray(part.faces)
+        uv = getattr(part.visual, "uv", None)
+        mesh = cls.from_arrays(part.vertices, faces, [paint_of(part)], uv=uv)
+        normals = part._cache.cache.get("vertex_normals")  # those of the file
+        return mesh if normals is None else replace(mesh, normals=np.asarray(normals)[faces])
 
     def recoloured(self, paint: Any) -> "TexturedMesh":
         """The mesh with one paint everywhere."""
         return replace(self, paint=np.zeros(len(self.triangles), int), paints=(paint,))
 
+    @cached_property
+    def hull(self) -> Array:
+        """(P, 3) corners of the convex hull; all corners of a flat mesh."""
+        points = self.triangles.reshape(-1, 3)
+        tolerance = 1e-6 * np.abs(points).max()
+        if np.linalg.matrix_rank(points - points[0], tol=tolerance) < 3:
+            return points
+        return points[ConvexHull(points).vertices]
+
     @property
     def radius(self) -> float:
         """Half the diagonal of the box around the mesh."""
-        return 0.5 * float(np.linalg.norm(np.ptp(self.hull, axis=0)))
+        return 0.5 * np.linalg.norm(np.ptp(self.hull, axis=0))
 
     @property
     def centre(self) -> Array:
         """(3,) middle of the box around the mesh."""
-        return 0.5 * (self.hull.min(axis=0) + self.hull.max(axis=0))
+        return middle_of(self.hull)
 
     def save_ply(self, path: Path) -> None:
         """Write a PLY file in mm, with all textures in one picture beside it, as BOP's textured
@@ -235,21 +245,6 @@ class Placed:
 def face_normals(corners: Array) -> Array:
     """(F, 3) normals of triangles (F, 3, 3), not normalised."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-
-
-def columns_of(part: trimesh.Trimesh) -> tuple[Array, Array, Array]:
-    """Corners (F, 3, 3), their normals, and texture coordinates (F, 3, 2) of a mesh that trimesh
-    has read."""
-    faces = np.asarray(part.faces)
-    corners = np.asarray(part.vertices)[faces]
-    normals = part._cache.cache.get("vertex_normals")  # those of the file
-    if normals is None:
-        normals = np.repeat(face_normals(corners)[:, None], 3, axis=1)
-    else:
-        normals = np.asarray(normals)[faces]
-    uv = getattr(part.visual, "uv", None)
-    uv = np.zeros((*faces.shape, 2)) if uv is None else np.asarray(uv)[faces]
-    return corners, normals, uv
 
 
 def paint_of(part: trimesh.Trimesh) -> Texture:

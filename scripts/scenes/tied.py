@@ -16,20 +16,21 @@ from scripts.scenes.surfaces import (
     join,
     lathe,
     rotation,
+    with_radius_1,
 )
 
 
 def holed(rng: Rng) -> Surface:
     """A body of revolution with one hole in its wall."""
-    levels = int(rng.integers(4, 9))
+    levels = rng.integers(4, 9)
     radii = rng.uniform(0.3, 0.45) * np.ones(levels)
     if rng.random() < 0.5:
         radii = radii * np.linspace(1.0, rng.uniform(0.6, 1.3), levels)
     heights = np.linspace(0.0, rng.uniform(0.6, 1.6), levels)
     body = lathe(radii, heights)
-    row = int(rng.integers(0, levels - 1))
-    columns = int(rng.integers(3, 8))
-    first = int(rng.integers(AROUND))
+    row = rng.integers(0, levels - 1)
+    columns = rng.integers(3, 8)
+    first = rng.integers(AROUND)
     cells = np.arange((levels - 1) * AROUND)
     of_row = cells // AROUND == row
     hidden = of_row & ((cells % AROUND - first) % AROUND < columns)
@@ -86,7 +87,7 @@ def plated(rng: Rng) -> Surface:
     h = rng.uniform(0.08, 0.3)
     round_body = rng.random() < 0.3
     body = _body(w, d, h, 0.5 * w if round_body else None)
-    radius = 0.5 * float(np.linalg.norm((w, w if round_body else d, h)))
+    radius = 0.5 * np.linalg.norm((w, w if round_body else d, h))
     long = rng.uniform(0.12, 0.3)
     wide = rng.uniform(0.12, 0.3)
     high = rng.uniform(0.03, 0.05) * radius
@@ -139,5 +140,4 @@ def tied_shape(rng: Rng, family: str) -> tuple[Array, Array]:
     ``FAMILIES``."""
     surface = FAMILIES[family](rng)
     points = surface.vertices @ rotation(2, rng.uniform(0.0, 2.0 * np.pi)).T
-    points = points - 0.5 * (points.min(axis=0) + points.max(axis=0))
-    return points / float(np.linalg.norm(points, axis=1).max()), surface.faces
+    return with_radius_1(points), surface.faces

@@ -23,6 +23,7 @@ not be kept for the second. An earlier command has registered ten others of the 
 import json
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -150,6 +151,26 @@ def timed(function: Callable[[Any], object], values: Sequence[Any]) -> dict[str,
     }
 
 
+def run_process(words: Sequence[str], folder: Path, environment: dict[str, str]) -> tuple[Any, ...]:
+    """Seconds, resources and output of a Python process in a folder; the script ends if the process
+    fails. On Windows, which does not count resources, an AttributeError.
+
+    Args:
+        words: arguments of the interpreter.
+    """
+    start = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, *words], env=environment, stdout=subprocess.PIPE, text=True, cwd=folder
+    )
+    output = process.stdout.read()
+    _, status, usage = os.wait4(process.pid, 0)
+    seconds = time.perf_counter() - start
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"{words} failed with PYTHONPATH={environment['PYTHONPATH']}")
+    return seconds, usage, output
+
+
 def measured(
     step: str,
     checkout: Path,
@@ -164,14 +185,14 @@ def measured(
     if step != "warm":
         call = f"measure({step!r}, {str(folder)!r}, {photographs})"
         words = ["-c", f"{HERE}; import json; print(json.dumps({call}))"]
-        _, usage, output = _shared.run_process(words, folder, environment)
+        _, usage, output = run_process(words, folder, environment)
         return {**json.loads(output.splitlines()[-1]), "megabytes": usage.ru_maxrss / 1024}
     # another checkout refuses to replace files that it did not write
     shutil.rmtree(folder / "out", ignore_errors=True)
     boxes = _shared.read_json(folder / "boxes.json")
     words = ["-m", "curvireg_torch", "register", f"photo{EARLIER}.png", "mesh.ply", "--out", "out"]
     words += ["--box", *map(str, boxes[EARLIER]), "--camera", *map(str, CAMERA)]
-    seconds, usage, _ = _shared.run_process(words, folder, environment)
+    seconds, usage, _ = run_process(words, folder, environment)
     processor = usage.ru_utime + usage.ru_stime
     return {"seconds": seconds, "processor_seconds": processor, "megabytes": usage.ru_maxrss / 1024}
 
@@ -188,7 +209,7 @@ def compare(
         folder = Path(temporary)
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         command = f"{HERE}; write_inputs({temporary!r}, {photographs})"
-        _shared.run_process(["-c", command], folder, environment)
+        run_process(["-c", command], folder, environment)
         for name, checkout in checkouts.items():
             bank_alone = folder / f"{name}-bank"
             measured("follow", checkout, folder, bank_alone, photographs)  # stores the bank

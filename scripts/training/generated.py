@@ -10,16 +10,16 @@ import trimesh
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from curvireg_torch.geometry.cameras import rotation_towards
 from curvireg_torch.geometry.crops import crop_transforms, square_boxes
 from scripts.scenes.families import random_shape
 from scripts.scenes.materials import Material, random_texture
-from scripts.scenes.scene import simulate_camera, single
+from scripts.scenes.scene import simulate_camera, single, towards
 from scripts.scenes.surfaces import Array, Rng
 from scripts.scenes.textured import Placed, TexturedMesh
 
 CLUTTER = 500  # shapes that clutter is drawn from; each process builds them once
 MARGIN = 0.1  # around the object's box, as in BankSettings
+SIZE = 128  # side of the crops in px
 
 
 class GeneratedScenes(Dataset[dict[str, Tensor]]):
@@ -28,7 +28,6 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
     Args:
         length: number of samples.
         seed: another seed gives other objects.
-        image_size: side of the crops in px.
         upright: fraction of the objects that stand upright.
 
     Items (a dict): ``image`` (3, S, S) float32 in [0, 1], ``depth`` (1, S, S) float32 in radii of
@@ -36,17 +35,9 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
     object, ``distance`` () float32 in radii.
     """
 
-    def __init__(
-        self,
-        length: int,
-        *,
-        seed: int = 0,
-        image_size: int = 128,
-        upright: float = 0.6,
-    ) -> None:
+    def __init__(self, length: int, *, seed: int = 0, upright: float = 0.6) -> None:
         self._length = length
         self._seed = seed
-        self._size = image_size
         self._upright = upright
 
     def __len__(self) -> int:
@@ -63,23 +54,22 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
             raise IndexError(index)
         rng = np.random.default_rng((self._seed, index, 1))
         shape = _painted(np.random.default_rng((self._seed, index)), rng)
-        upright = bool(rng.random() < self._upright)
-        occluded = bool(rng.random() < 0.3)
+        upright = rng.random() < self._upright
+        occluded = rng.random() < 0.3
         scene = single(shape, 1, _clutter, random_texture, rng, upright=upright, occluded=occluded)
         R, t, _ = scene.views[0]
         target = scene.shapes[0]
         centre = R @ target.points(shape.centre) + t
-        straight = rotation_towards(torch.from_numpy(centre)).numpy().T
+        straight = towards(centre).T
         R = straight @ R
         t = straight @ t
-        size = self._size
-        K, (x0, y0, x1, y1) = _crop_camera(target, R, t, rng, size)
-        picture = scene.render((R, t, K), (size, size))
+        K, (x0, y0, x1, y1) = _crop_camera(target, R, t, rng)
+        picture = scene.render((R, t, K), (SIZE, SIZE))
         # hidden objects are of no use for training
         if picture.seen.sum() < 0.1 * picture.whole.sum():
-            picture = replace(scene, shapes=[target]).render((R, t, K), (size, size))
+            picture = replace(scene, shapes=[target]).render((R, t, K), (SIZE, SIZE))
         inside = picture.linear[y0:y1, x0:x1]
-        border = ((y0, size - y1), (x0, size - x1), (0, 0))
+        border = ((y0, SIZE - y1), (x0, SIZE - x1), (0, 0))
         image = simulate_camera(np.pad(inside, border, mode="edge"), rng)
         return {
             "image": torch.from_numpy(image).permute(2, 0, 1).float() / 255.0,
@@ -97,7 +87,7 @@ def _painted(rng: Rng, paint: Rng) -> TexturedMesh:
 
 
 def _clutter(rng: Rng) -> TexturedMesh:
-    return _numbered(int(rng.integers(CLUTTER)))
+    return _numbered(rng.integers(CLUTTER))
 
 
 @lru_cache(maxsize=CLUTTER)
@@ -111,7 +101,6 @@ def _crop_camera(
     R: Array,
     t: Array,
     rng: Rng,
-    size: int,
 ) -> tuple[Array, tuple[int, int, int, int]]:
     """Camera matrix of the crop around a jittered box, and the part of the crop that lies within
     the photograph."""
@@ -123,14 +112,13 @@ def _crop_camera(
     box += rng.normal(0, deviation, 4) * np.tile(side, 2)
     cut = None  # the side of the box at which the photograph's border cuts the object
     if rng.random() < 0.2:
-        cut = int(rng.integers(4))
+        cut = rng.integers(4)
         inwards = 1 - 2 * (cut // 2)
         box[cut] += inwards * rng.uniform(0.1, 0.45) * side[cut % 2]
-    A = crop_transforms(square_boxes(torch.from_numpy(box), MARGIN), size).numpy()
-    area = [0, 0, size, size]
+    A = crop_transforms(square_boxes(torch.from_numpy(box), MARGIN), SIZE).numpy()
+    area = [0, 0, SIZE, SIZE]
     if cut is not None:
         axis = cut % 2
         place = A[axis, axis] * box[cut] + A[axis, 2]
-        area[cut] = int(np.clip(np.round(place + 0.5), 0, size))
-    x0, y0, x1, y1 = area
-    return A, (x0, y0, x1, y1)
+        area[cut] = int(np.clip(np.round(place + 0.5), 0, SIZE))
+    return A, tuple(area)

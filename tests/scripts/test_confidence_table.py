@@ -1,3 +1,4 @@
+import json
 from copy import deepcopy
 
 import pytest
@@ -24,6 +25,8 @@ ROWS = """\
 
 def run(folder, column):
     folder.mkdir()
+    summary = {"settings": {"dataset": "bop" if column == "rotation" else "pascal3d"}}
+    (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
     (folder / "results.jsonl").write_text(ROWS, encoding="utf-8")
     errors = f"key,group,{column}\na,1,29.9\nb,1,30.1\nc,2,3.0\nd,2,\n"
     (folder / "errors.csv").write_text(errors, encoding="utf-8")
