@@ -2,17 +2,18 @@
 
 import argparse
 import datetime
+import inspect
 import json
 import os
 import subprocess
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 from tqdm import tqdm
 
-from curvireg_torch.errors import WorkerError
+from curvireg_torch.errors import CurviregError, WorkerError
 from curvireg_torch.formats.meshes.files import mesh_digest
 from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.utils.executors import Workers
@@ -25,11 +26,44 @@ WRITTEN = ("scripts/results", "docs", "README.md")
 """Paths that scripts write to. A change there does not affect what a script measures."""
 
 
-def parser_of(description: str | None) -> argparse.ArgumentParser:
-    """A parser of options whose help is a script's docstring as it is written."""
-    return argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+def run(main: Callable[..., Any]) -> Any:
+    """Call the ``main`` of a script with the arguments of the command line, which its parameters
+    describe; the help is the script's docstring. Errors of the library end it with their message.
+
+    Parameters by keyword are options. ``Literal`` lists what may be chosen, ``bool`` is a switch,
+    ``list`` is one value or several, and ``tuple`` as many as it has types.
+    """
+    parser = argparse.ArgumentParser(
+        description=main.__globals__["__doc__"],
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    for name, parameter in inspect.signature(main).parameters.items():
+        how = _argument(parameter.annotation)
+        if parameter.kind is parameter.KEYWORD_ONLY:
+            name = f"--{name.replace('_', '-')}"
+            how |= {"default": parameter.default, "required": parameter.default is parameter.empty}
+        elif parameter.default is not parameter.empty:
+            how["nargs"] = "*"
+        parser.add_argument(name, **how)
+    try:
+        return main(**vars(parser.parse_args()))
+    except CurviregError as error:
+        parser.error(str(error))
+
+
+def _argument(kind: Any) -> dict[str, Any]:
+    """What argparse has to know of an argument of a type."""
+    origin = get_origin(kind)
+    parts = get_args(kind)
+    if kind is bool:
+        return {"action": "store_true"}
+    if origin is Literal:
+        return {"choices": parts}
+    if origin is list:
+        return _argument(parts[0]) | {"nargs": "+"}
+    if origin is tuple:
+        return _argument(parts[0]) | {"nargs": len(parts)}
+    return _argument(parts[0]) if parts else {"type": kind}  # parts are those of X | None
 
 
 def update_page(page: Path, name: str, body: str) -> None:

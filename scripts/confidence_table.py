@@ -22,9 +22,9 @@ from scripts._shared import (
     RESULTS,
     RIGHT_DEG,
     markdown_table,
-    parser_of,
     read_json,
     read_lines,
+    run,
     stamp,
     update_page,
     write_json,
@@ -34,18 +34,15 @@ GENERATED = read_json(Path(__file__).with_name("tables.json"))["generated"]
 """By the name of their set in scripts/calibration: what photographs show."""
 
 
-def main() -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("run", nargs="*", type=Path, help="folder of curvireg evaluate")
-    options = parser.parse_args()
+def main(folders: list[Path] = ()) -> None:
     page = REPOSITORY / "docs" / "accuracy.md"
     calibration = read_json(RESULTS / "calibration.json")
     update_page(page, "generated", generated_part(calibration))
     update_page(page, "withheld", table_of_withheld(calibration["held out"]["instance"]["sets"]))
-    if options.run:
+    if folders:
         path = RESULTS / "confidence.json"
         stored = read_json(path)["sets"] if path.exists() else []
-        rows = merged(stored, [measured(run) for run in options.run])
+        rows = merged(stored, [measured(folder) for folder in folders])
         record = stamp() | {"sets": rows}
         write_json(path, record)
         update_page(page, "confidence", table(rows))
@@ -59,11 +56,11 @@ def merged(
     return list({row["name"]: row for row in [*stored, *rows]}.values())
 
 
-def measured(run: Path) -> dict[str, Any]:
+def measured(folder: Path) -> dict[str, Any]:
     """What the confidences of one run are worth; objects without a pose count as wrong, with
     confidence 0."""
-    results = {row["key"]: row for row in read_lines(run / "results.jsonl")}
-    evaluated = read_run(run)
+    results = {row["key"]: row for row in read_lines(folder / "results.jsonl")}
+    evaluated = read_run(folder)
     errors = evaluated.errors
     scored = DATASETS[evaluated.dataset].scored.page_error
     found = [results[key] for key in errors]
@@ -73,7 +70,7 @@ def measured(run: Path) -> dict[str, Any]:
         is_right for is_right, result in zip(right, found, strict=True) if result.get("reliable")
     ]
     return {
-        "name": run.name,
+        "name": folder.name,
         "n": len(errors),
         "mean_confidence": fmean(confidences),
         "right": fmean(right),
@@ -149,4 +146,4 @@ def share(value: float | None) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,10 +1,12 @@
 """Write the tables of results, in words into the README and whole into docs/accuracy.md, from
 ``scripts/results/evaluation_*.json``.
 
-    python scripts/results_table.py --record DIR/summary.json NAME    store a summary of
-    ``curvireg evaluate`` as NAME python scripts/results_table.py --compare DIR/summary.json ...
-    print them beside the stored ones python scripts/results_table.py
-       write the tables
+    python scripts/results_table.py --record DIR/summary.json NAME
+    python scripts/results_table.py --compare DIR/summary.json ...
+    python scripts/results_table.py
+
+The first stores a summary of ``curvireg evaluate`` under a name, the second prints summaries beside
+the stored ones of the same names, the last writes the tables.
 
 A stored summary contains the date and the commit at which it was recorded ("+": with uncommitted
 changes), so record it right after measuring.
@@ -22,8 +24,8 @@ from scripts._shared import (
     RESULTS,
     RIGHT_DEG,
     markdown_table,
-    parser_of,
     read_json,
+    run,
     stamp,
     update_page,
     write_json,
@@ -41,29 +43,22 @@ LIGHTINGS = SHOWN["lightings"]
 """Of sets with several lightings of a view: their number; objects are not independent."""
 
 
-def main() -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument(
-        "--record", nargs=2, metavar=("SUMMARY", "NAME"), help="store a summary.json under a name"
-    )
-    parser.add_argument(
-        "--compare",
-        nargs="+",
-        type=Path,
-        metavar="SUMMARY",
-        help="print summaries beside stored ones",
-    )
-    arguments = parser.parse_args()
-    if arguments.record:
-        print(record(Path(arguments.record[0]), arguments.record[1]))
-    elif arguments.compare:
-        print(comparison(arguments.compare, RESULTS))
+def main(
+    *,
+    record: tuple[str, str] | None = None,
+    compare: list[Path] | None = None,
+) -> None:
+    if record:
+        summary, name = record
+        print(store(Path(summary), name))
+    elif compare:
+        print(comparison(compare, RESULTS))
     else:
         update_page(REPOSITORY / "README.md", "results", table_in_words(RESULTS))
         update_page(REPOSITORY / "docs" / "accuracy.md", "sets", table(RESULTS))
 
 
-def record(summary: Path, name: str) -> Path:
+def store(summary: Path, name: str) -> Path:
     """Store ``summary`` with the date and the commit; returns the path."""
     path = RESULTS / f"evaluation_{name}.json"
     content = read_json(summary)
@@ -200,4 +195,4 @@ def degrees(value: float | None) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -3,8 +3,8 @@
     python scripts/videos.py FOLDER ... [--record]
 
 A folder holds frames/NAME.jpg, mesh.ply, camera.json (fx, fy, cx, cy) and truth.json: by NAME, R
-and t in the mesh's unit, mm. The box of the first frame is that of the true pose. Errors are up to
-the symmetries of the shape.
+and t in the mesh's unit, mm. --record stores the result for the README's table. The box of the
+first frame is that of the true pose. Errors are up to the symmetries of the shape.
 """
 
 import json
@@ -18,19 +18,14 @@ from curvireg_torch.data import read_image
 from curvireg_torch.evaluation.metrics import symmetric_rotation_error
 from curvireg_torch.geometry import projected_boxes, transform
 from curvireg_torch.registration import Follower
-from scripts._shared import RESULTS, parser_of, read_json, stamp, write_json
+from scripts._shared import RESULTS, read_json, run, stamp, write_json
 
 
-def main() -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("folder", nargs="+", type=Path)
-    parser.add_argument("--record", action="store_true", help="store it for the README's table")
-    options = parser.parse_args()
-    videos = [followed(folder) for folder in options.folder]
+def main(folders: list[Path], *, record: bool = False) -> None:
+    videos = [followed(folder) for folder in folders]
     print(json.dumps(videos, indent=2))
-    if options.record:
-        record = stamp() | {"videos": videos}
-        write_json(RESULTS / "videos.json", record)
+    if record:
+        write_json(RESULTS / "videos.json", stamp() | {"videos": videos})
 
 
 def followed(folder: Path) -> dict[str, Any]:
@@ -57,4 +52,4 @@ def followed(folder: Path) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,30 +1,31 @@
 """Render photographs with known poses in BOP's layout, for `curvireg evaluate bop`.
 
     python scripts/benchmark/make.py --kind printed --count 300 --out /data/printed [--jobs 2]
-    python scripts/benchmark/make.py --kind shelf --objects 8 20 --cameras 3 --count 100 --out
-    /data/shelf python scripts/benchmark/make.py --kind furniture --meshes /data/furniture --count
-    300 --out /data/chairs
+    python scripts/benchmark/make.py --kind shelf --objects 8 20 --cameras 3 --out /data/shelf
+    python scripts/benchmark/make.py --kind furniture --meshes /data/furniture --out /data/chairs
 
 --kind: ``printed`` packages, whose labels alone tell their sides apart; ``furniture`` of meshes.py;
 ``shapes``, the procedural families of scripts/scenes; ``tied`` ones, of which several poses look
-the same from most sides; ``shelf``, several printed packages side by side, all annotated. A scene
-has one photograph, or one for each of --cameras, or --frames of a moving camera. --cut puts a
-fraction of the object outside the photograph. To calibrate confidence, --cad annotates an object as
-another one: similar, of its kind; wrong, any other; print, a package of the same shape with another
-print; mirrored, a tied shape's mirror image; variant, the shape with one part folded, moved, left
-out, or of another size. Scene i depends only on the seed, --models and i; an interrupted
-run can be resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette inside the picture,
-``bbox_visib`` of its visible part. OUT/benchmark.json holds the options, and the group of each
-object for scripts/calibration.
+the same from most sides; ``shelf``, several printed packages side by side, all annotated. --models
+packages or shapes are there to choose from; a shelf has --objects LOW HIGH of them. A scene has one
+photograph, or one for each of --cameras, or --frames of a moving camera. --cut LOW HIGH puts a
+fraction of the object outside the photograph; --occlusion is the largest hidden fraction of a
+target, --bare the fraction of the objects that get one uniform colour. To calibrate confidence,
+--cad annotates an object as another one: similar, of its kind; wrong, any other; print, a package
+of the same shape with another print; mirrored, a tied shape's mirror image; variant, the shape with
+one part folded, moved, left out, or of another size. Scene i depends only on the seed, --models and
+i; an interrupted run can be resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette inside
+the picture, ``bbox_visib`` of its visible part. OUT/benchmark.json holds the options, and the group
+of each object for scripts/calibration.
 """
 
 import shutil
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -35,7 +36,7 @@ from scipy.spatial.distance import pdist
 
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.mesh import mesh_symmetries
-from scripts._shared import in_processes, parser_of, read_json, write_json
+from scripts._shared import in_processes, read_json, run, write_json
 from scripts.scenes.families import FAMILIES, random_shape
 from scripts.scenes.materials import random_texture
 from scripts.scenes.packages import package
@@ -45,7 +46,6 @@ from scripts.scenes.textured import Placed, TexturedMesh, plain_texture
 from scripts.scenes.tied import FAMILIES as TIED_FAMILIES
 from scripts.scenes.tied import tied_shape
 
-CADS = ("exact", "similar", "wrong", "print", "mirrored", "variant")
 # fraction of the surface that has the same material after a symmetry of the appearance
 SAME_LOOK = 0.97
 TWINS = ("print", "mirrored", "variant")
@@ -485,78 +485,57 @@ def _box(mask: Array) -> list[int]:
     return [x, y, width - 1, height - 1] if width else [-1, -1, -1, -1]
 
 
-def write_targets(options: Namespace) -> int:
+def write_targets(out: Path, occlusion: float) -> int:
     """List the instances that are visible enough in BOP's ``test_targets_bop19.json``; their
     number."""
     targets = []
-    for folder in sorted((options.out / "test").iterdir()):
+    for folder in sorted((out / "test").iterdir()):
         if not folder.name.isdecimal():  # begun
             continue
         truths = read_json(folder / "scene_gt.json")
         infos = read_json(folder / "scene_gt_info.json")
         for key in sorted(truths, key=int):
             for truth, info in zip(truths[key], infos[key], strict=True):
-                is_visible = info["visib_fract"] >= 1.0 - options.occlusion
+                is_visible = info["visib_fract"] >= 1.0 - occlusion
                 if is_visible and min(info["bbox_visib"][2:]) >= 1:
                     target = {"scene_id": int(folder.name), "im_id": int(key)}
                     targets.append(target | {"obj_id": truth["obj_id"], "inst_count": 1})
-    write_json(options.out / "test_targets_bop19.json", targets)
+    write_json(out / "test_targets_bop19.json", targets)
     return len(targets)
 
 
-def arguments() -> ArgumentParser:
-    parser = parser_of(__doc__)
-    parser.add_argument("--kind", choices=KINDS, default="printed")
-    parser.add_argument("--count", type=int, default=300, help="scenes")
-    parser.add_argument("--seed", type=int, default=29)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--models", type=int, default=60, help="printed packages to choose from")
-    parser.add_argument("--meshes", type=Path, help="folder of meshes.py, for furniture")
-    parser.add_argument("--cad", choices=CADS, default="exact")
-    parser.add_argument(
-        "--bare", type=float, default=0.0, help="fraction of the objects in one uniform colour"
-    )
-    parser.add_argument(
-        "--objects", type=int, nargs=2, default=(8, 20), metavar=("LOW", "HIGH"), help="on a shelf"
-    )
-    parser.add_argument(
-        "--occlusion", type=float, default=0.6, help="largest hidden fraction of a target"
-    )
-    parser.add_argument(
-        "--cut",
-        type=float,
-        nargs=2,
-        metavar=("LOW", "HIGH"),
-        help="fraction outside the photograph",
-    )
-    parser.add_argument(
-        "--cameras", type=int, default=1, help="photographs of each scene, from different sides"
-    )
-    parser.add_argument(
-        "--frames", type=int, default=1, help="photographs of each scene by one moving camera"
-    )
-    parser.add_argument("--jobs", type=int, default=1)
-    return parser
-
-
-def main() -> None:
-    options = arguments().parse_args()
-    kind = Variants if options.cad == "variant" else KINDS[options.kind]
-    objects = kind(options)
-    (options.out / "test").mkdir(parents=True, exist_ok=True)
-    models = options.out / "models"
-    models.mkdir(exist_ok=True)
-    ids = objects.written
-    rows = dict(in_processes(partial(model_row, objects, models), ids, options.jobs, "models"))
-    write_json(models / "models_info.json", {obj_id: rows[obj_id] for obj_id in ids})
-    scene = partial(make_scene, objects, options)
-    list(in_processes(scene, range(options.count), options.jobs, "scenes"))
+def main(
+    *,
+    kind: Literal[*KINDS] = "printed",
+    count: int = 300,
+    seed: int = 29,
+    out: Path,
+    models: int = 60,
+    meshes: Path | None = None,
+    cad: Literal["exact", "similar", "wrong", "print", "mirrored", "variant"] = "exact",
+    bare: float = 0.0,
+    objects: tuple[int, int] = (8, 20),
+    occlusion: float = 0.6,
+    cut: tuple[float, float] | None = None,
+    cameras: int = 1,
+    frames: int = 1,
+    jobs: int = 1,
+) -> None:
+    options = Namespace(**locals())
+    known = (Variants if cad == "variant" else KINDS[kind])(options)
+    (out / "test").mkdir(parents=True, exist_ok=True)
+    folder = out / "models"
+    folder.mkdir(exist_ok=True)
+    ids = known.written
+    rows = dict(in_processes(partial(model_row, known, folder), ids, jobs, "models"))
+    write_json(folder / "models_info.json", {obj_id: rows[obj_id] for obj_id in ids})
+    list(in_processes(partial(make_scene, known, options), range(count), jobs, "scenes"))
     kept = {name: value for name, value in vars(options).items() if name not in ("out", "jobs")}
-    kept["meshes"] = options.meshes and str(options.meshes)
-    kept["groups"] = {obj_id: objects.group(obj_id % TWIN) for obj_id in ids}
-    write_json(options.out / "benchmark.json", kept)
-    print(f"{write_targets(options)} targets in {options.count} scenes in {options.out}")
+    kept["meshes"] = meshes and str(meshes)
+    kept["groups"] = {obj_id: known.group(obj_id % TWIN) for obj_id in ids}
+    write_json(out / "benchmark.json", kept)
+    print(f"{write_targets(out, occlusion)} targets in {count} scenes in {out}")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

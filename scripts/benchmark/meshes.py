@@ -7,8 +7,9 @@ object has a folder of its own; z is up, the front points along -y, and units ar
 OUT/meshes.json lists name, kind, licence, and the symmetries of shape and of appearance, of half of
 the objects, by a hash of their names.
 
-    python scripts/benchmark/meshes.py --out /data/benchmark [--deb
-    sweethome3d-furniture_1.8-1_all.deb]
+    python scripts/benchmark/meshes.py --out /data/furniture [--deb FILE]
+
+FILE is the package, which apt-get downloads otherwise.
 """
 
 import hashlib
@@ -23,7 +24,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from scripts._shared import in_processes, parser_of, read_json, write_json
+from scripts._shared import in_processes, read_json, run, write_json
 from scripts.scenes.textured import TexturedMesh
 
 PACKAGE = "sweethome3d-furniture"
@@ -235,19 +236,14 @@ def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, np.ndarray
     return row, None, cloud
 
 
-def main() -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--deb", type=Path, help="file of the package (default: apt-get download)")
-    parser.add_argument("--jobs", type=int, default=1)
-    arguments = parser.parse_args()
-    unpacked = fetch(arguments.out, arguments.deb)
+def main(*, out: Path, deb: Path | None = None, jobs: int = 1) -> None:
+    unpacked = fetch(out, deb)
     once = {row["id"]: row for row in reversed(catalogue(unpacked))}  # removes duplicates
-    tasks = [(row, unpacked, arguments.out) for name, row in sorted(once.items()) if is_used(name)]
+    tasks = [(row, unpacked, out) for name, row in sorted(once.items()) if is_used(name)]
     meshes = []
     left_out = {}
     clouds = {}
-    examined = [found for _, found in in_processes(examine, tasks, arguments.jobs, "meshes")]
+    examined = [found for _, found in in_processes(examine, tasks, jobs, "meshes")]
     for row, why, cloud in sorted(examined, key=lambda found: found[0]["id"]):
         if why is not None:
             left_out[row["id"]] = why
@@ -256,9 +252,9 @@ def main() -> None:
         clouds[row["id"]] = np.ptp(cloud, axis=0), cKDTree(cloud)
         meshes.append({**row, "like": like})
     listing = {"package": PACKAGE, "sha256": SHA256, "turns": candidate_rotations().tolist()}
-    write_json(arguments.out / "meshes.json", listing | {"meshes": meshes, "left_out": left_out})
+    write_json(out / "meshes.json", listing | {"meshes": meshes, "left_out": left_out})
     print(f"{len(meshes)} meshes; left out {len(left_out)}")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

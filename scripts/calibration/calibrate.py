@@ -1,8 +1,8 @@
 """Fit the constants of confidence, covariance, detection, refinement and following on generated
 photographs.
 
-    python scripts/calibration/calibrate.py WORK [--meshes FURNITURE] [--count 400] [--models
-    instance] [--write]
+    python scripts/calibration/calibrate.py WORK [--meshes FURNITURE] [--count 400] [--write]
+        [--models instance]
 
 The script renders the sets of sets.json that WORK lacks (the object's own mesh, also cut by the
 border, half hidden, grey, or with several poses that look alike; a similar one; a wrong one, or one
@@ -17,13 +17,14 @@ curvireg_torch/calibration/calibration.json and their quality in scripts/results
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from curvireg_torch.registration.confidence import RELIABLE
-from scripts._shared import REPOSITORY, RESULTS, parser_of, read_json, stamp, write_json
+from scripts._shared import REPOSITORY, RESULTS, read_json, run, stamp, write_json
 from scripts.calibration.fits import first_probability, fit_logistic, fit_registrations
 from scripts.calibration.measure import Row, rows_of
 from scripts.calibration.sets import KINDS, MODELS, render_sets, sets_of
@@ -70,23 +71,23 @@ def covariance_quality(distances: ArrayLike, scale: float) -> Row:
     }
 
 
-def main() -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("work", type=Path)
-    parser.add_argument("--meshes", type=Path, help="folder of scripts/benchmark/meshes.py")
-    parser.add_argument("--count", type=int, default=400, help="photographs of each set")
-    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--write", action="store_true")
-    options = parser.parse_args()
-    render_sets(options.work, options.meshes, options.count, options.jobs, options.models)
-    constants, quality = calibrate(options.work, options.jobs, options.models, options.meshes)
+def main(
+    work: Path,
+    *,
+    meshes: Path | None = None,
+    count: int = 400,
+    models: list[Literal[*MODELS]] = tuple(MODELS),
+    jobs: int = 1,
+    write: bool = False,
+) -> None:
+    render_sets(work, meshes, count, jobs, models)
+    constants, quality = calibrate(work, jobs, models, meshes)
     record = stamp() | {"constants": constants, "held out": quality}
     print(json.dumps(record, indent=2))
-    if options.write:
+    if write:
         write_json(CONSTANTS, constants)
         write_json(RESULTS / "calibration.json", record)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -3,7 +3,7 @@
     python scripts/calibration/misleading.py WORK [--each 50] [--jobs 2] [--sets shapes variant]
 
 WORK is a folder of calibrate.py, whose photographs serve; finished rows in WORK/misleading.jsonl
-are kept. Each kind misleads in one or several ways:
+are kept; --each is the number of photographs of a kind. Each kind misleads in one or several ways:
 
 - camera: a matrix of half, two thirds or 1.6 times the size, a focal length of 0.7 or 1.3 times, a
   photograph stretched by 1.25, a lens whose distortion is not known
@@ -27,7 +27,7 @@ from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -42,8 +42,8 @@ from scripts._shared import (
     RESULTS,
     RIGHT_DEG,
     measured,
-    parser_of,
     read_json,
+    run,
     stamp,
     write_json,
 )
@@ -273,19 +273,18 @@ def table_of(rows: Sequence[Row]) -> Row:
     }
 
 
-def main() -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("work", type=Path)
-    parser.add_argument("--each", type=int, default=50, help="photographs of each kind")
-    parser.add_argument("--sets", nargs="+", choices=SOURCES, default=list(SOURCES))
-    parser.add_argument("--jobs", type=int, default=1)
-    options = parser.parse_args()
+def main(
+    work: Path,
+    *,
+    each: int = 50,
+    sets: list[Literal[*SOURCES]] = tuple(SOURCES),
+    jobs: int = 1,
+) -> None:
     tasks = {}
-    for name in options.sets:
-        for folder, kinds, indices in tasks_of(options.work, name, options.each):
+    for name in sets:
+        for folder, kinds, indices in tasks_of(work, name, each):
             tasks[str([name, kinds, indices])] = (folder, kinds, indices)
-    out = options.work / "misleading.jsonl"
-    rows = measured(out, measure, tasks, options.jobs, "misleading")
+    rows = measured(work / "misleading.jsonl", measure, tasks, jobs, "misleading")
     misleading = [row for row in rows if row["kind"] != "ordinary"]
     record = stamp() | {"misleading": table_of(misleading), "kinds": {}}
     for kind, way in sorted({(row["kind"], row["way"]) for row in rows}):
@@ -297,4 +296,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -2,7 +2,7 @@
 
     pip install 'curvireg_torch[paper]'
     python scripts/paper/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR [--jobs N]
-        [--page docs/paper.md]
+        [--image-size PX] [--page docs/paper.md]
 
 TABLE is one of
 
@@ -26,29 +26,28 @@ for each mesh: an interrupted run goes on where it was. --page writes all tables
 with the commit, into a page.
 """
 
-import argparse
 import shutil
 import sys
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
 sys.path.insert(0, str(REPOSITORY))
 
-from curvireg_torch.errors import CurviregError, MissingDependencyError
+from curvireg_torch.errors import MissingDependencyError
 from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.utils.files import write_file
 from scripts._shared import (
     commit,
     measured,
-    parser_of,
     read_lines,
     request_digest,
+    run,
     update_page,
 )
 from scripts.paper import tables as paper
@@ -102,29 +101,37 @@ def measure(
     ]
 
 
-def run(arguments: argparse.Namespace) -> None:
+def main(
+    table: Literal[*TABLES, "all"],
+    kind: Literal[*DATASETS],
+    root: Path,
+    *,
+    out: Path,
+    jobs: int = 1,
+    image_size: int = 128,
+    page: Path | None = None,
+) -> None:
     check_packages()
-    cases = find_cases(arguments.kind, arguments.root)
-    settings = BankSettings(image_size=arguments.image_size)
-    what = f"{arguments.root.name}, crops of {settings.image_size} px"
+    cases = find_cases(kind, root)
+    settings = BankSettings(image_size=image_size)
+    what = f"{root.name}, crops of {image_size} px"
     for phase, makers in PHASES.items():
-        chosen = [name for name in makers if arguments.table in ("all", name)]
+        chosen = [name for name in makers if table in ("all", name)]
         if not chosen:
             continue
-        state = (phase, settings, DATASETS[arguments.kind].pose)
+        state = (phase, settings, DATASETS[kind].pose)
         groups = {request_of(*state, group): group for group in by_mesh(cases)}
-        measure_group = partial(measure, *state)
-        found = measured(arguments.out / RECORDS, measure_group, groups, arguments.jobs, phase)
+        found = measured(out / RECORDS, partial(measure, *state), groups, jobs, phase)
         records = paper.Records(found, what)
         for name in chosen:
-            for table in makers[name](records):
-                text = table.markdown()
-                write_file(arguments.out / f"{table.name}.md", text.encode())
+            for made in makers[name](records):
+                text = made.markdown()
+                write_file(out / f"{made.name}.md", text.encode())
                 print(text, flush=True)
             if name == "curve":
-                draw_curve(records, arguments.out / CURVE)
-    if arguments.page is not None:
-        write_page(arguments.out, arguments.page)
+                draw_curve(records, out / CURVE)
+    if page is not None:
+        write_page(out, page)
 
 
 def request_of(
@@ -185,24 +192,5 @@ def write_page(folder: Path, page: Path) -> None:
             update_page(page, block, "\n".join(lines))
 
 
-def main() -> int:
-    parser = parser_of(__doc__)
-    parser.add_argument("table", choices=(*TABLES, "all"), metavar="TABLE")
-    parser.add_argument("kind", choices=DATASETS)
-    parser.add_argument("root", type=Path, metavar="ROOT")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
-    parser.add_argument(
-        "--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)"
-    )
-    parser.add_argument("--page", type=Path, help="page of the documentation that gets the tables")
-    try:
-        run(parser.parse_args())
-    except CurviregError as error:
-        print(f"reproduce_paper: error: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

@@ -1,19 +1,18 @@
 """From the letter of the paper to the default pipeline, one change at a time.
 
     python scripts/paper/staircase.py pascal3d=/data/pascal3d_mini lm=/data/bop/lm --out DIR
-        [--limit N] [--jobs N] [--page PAGE]
+        [--limit N] [--steps STEP ...] [--jobs N] [--page PAGE]
 
 Each set is NAME=ROOT: ROOT is a PASCAL3D+ release if it has a folder ``CAD``, else a BOP set. Steps
-are cumulative. DIR/NAME/STEP holds what ``curvireg evaluate`` writes, which registers only what is
-missing: the same command again prints the table alone. --page writes it into a page of the
-documentation, between its markers.
+are cumulative; --limit takes N objects of each set, spread evenly. DIR/NAME/STEP holds what
+``curvireg evaluate`` writes, which registers only what is missing: the same command again prints
+the table alone. --page writes it into a page of the documentation, between its markers.
 """
 
-import argparse
 import math
 import statistics
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -22,13 +21,13 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
 sys.path.insert(0, str(REPOSITORY))
 
-from curvireg_torch.errors import CurviregError, InvalidInputError
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import DATASETS, Benchmark, Protocol, evaluate
 from curvireg_torch.evaluation.compare import read_run
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.terms import Appearance, BoxShape
 from curvireg_torch.utils.executors import Workers
-from scripts._shared import RIGHT_DEG, commit, markdown_table, parser_of, update_page
+from scripts._shared import RIGHT_DEG, commit, markdown_table, run, update_page
 from scripts.paper.measures import Estimate, bootstrap
 
 FEWEST_CADS = 3  # for an interval
@@ -106,26 +105,27 @@ Scores = Mapping[int, Score]
 """By the number of the step."""
 
 
-def climb(name: str, root: Path, options: argparse.Namespace) -> Scores:
-    """Evaluate the steps of one set."""
+def climb(
+    root: Path,
+    out: Path,
+    steps: Sequence[int] | None,
+    limit: int | None,
+    jobs: int,
+) -> Scores:
+    """Evaluate some steps on one set, or all."""
     benchmark = benchmark_of(root)
     cads = {}
     for entry, sample in zip(benchmark.entries, benchmark.samples, strict=True):
         cads[entry.key] = str(sample[benchmark.mesh])
     scores = {}
     for k, (_, pipeline) in enumerate(pipelines(benchmark.protocol.pose)):
-        if k not in (options.steps or [k]):
+        if steps and k not in steps:
             continue
-        folder = options.out / name / f"{k}"
-        summary = evaluate(
-            benchmark,
-            folder,
-            pipeline=pipeline,
-            workers=Workers(options.jobs),
-            limit=options.limit,
-        )
+        folder = out / f"{k}"
+        workers = Workers(jobs)
+        summary = evaluate(benchmark, folder, pipeline=pipeline, workers=workers, limit=limit)
         if summary["skipped"]:
-            print(f"staircase: {name}: left out: {dict(summary['skipped'])}", file=sys.stderr)
+            print(f"staircase: {root}: left out: {dict(summary['skipped'])}", file=sys.stderr)
         errors = []
         of_cads = []
         for key, each in read_run(folder).errors.items():
@@ -156,32 +156,26 @@ def table(sets: Mapping[str, Scores]) -> str:
     return f"{text}. Commit {commit()}.\n\n{markdown_table(cells)}"
 
 
-def main() -> int:
-    parser = parser_of(__doc__)
-    parser.add_argument("sets", nargs="+", metavar="NAME=ROOT")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument(
-        "--limit", type=int, metavar="N", help="N objects of each set, spread evenly"
-    )
-    parser.add_argument("--steps", type=int, nargs="+", help="numbers of steps (default: all)")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
-    parser.add_argument("--page", type=Path, help="page of the documentation that gets the table")
-    options = parser.parse_args()
-    sets = {}
-    try:
-        for word in options.sets:
-            name, _, root = word.partition("=")
-            if not root:
-                raise InvalidInputError(f"expected NAME=ROOT, got {word!r}")
-            sets[name] = climb(name, Path(root), options)
-    except CurviregError as error:
-        print(f"staircase: error: {error}", file=sys.stderr)
-        return 2
-    print(text := table(sets))
-    if options.page is not None:
-        update_page(options.page, "staircase", text)
-    return 0
+def main(
+    sets: list[str],
+    *,
+    out: Path,
+    limit: int | None = None,
+    steps: list[int] | None = None,
+    jobs: int = 1,
+    page: Path | None = None,
+) -> None:
+    scores = {}
+    for word in sets:
+        name, _, root = word.partition("=")
+        if not root:
+            raise InvalidInputError(f"expected NAME=ROOT, got {word!r}")
+        scores[name] = climb(Path(root), out / name, steps, limit, jobs)
+    text = table(scores)
+    print(text)
+    if page is not None:
+        update_page(page, "staircase", text)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

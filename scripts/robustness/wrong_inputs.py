@@ -1,9 +1,8 @@
 """Give every command wrong inputs: each must end in a result or in one line of ours, within limits,
 never a traceback.
 
-    python scripts/robustness/wrong_inputs.py                    # command lines with one mistake,
-    then damaged files python scripts/robustness/wrong_inputs.py --damaged 5000     # more damaged
-    files
+    python scripts/robustness/wrong_inputs.py
+    python scripts/robustness/wrong_inputs.py --damaged 5000     # files instead of 200
 
 wrong_inputs.txt lists command lines, and files with one mistake each, and what the message must
 contain. Damaged files are good photographs, meshes, cameras, banks and lists with bytes changed,
@@ -31,7 +30,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from scripts._shared import RESULTS, parser_of, read_json, stamp, write_json
+from scripts._shared import RESULTS, read_json, run, stamp, write_json
 
 # processor seconds and memory that a command may take
 SECONDS = 20.0
@@ -186,22 +185,18 @@ def damage(data: bytes, rng: np.random.Generator) -> bytes:
     return bytes(out)
 
 
-def main() -> int:
-    parser = parser_of(__doc__)
-    parser.add_argument("--damaged", type=int, default=200)
-    parser.add_argument("--jobs", type=int, default=1)
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(options.jobs) as pool:
+def main(*, damaged: int = 200, jobs: int = 1) -> int:
+    with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(jobs) as pool:
         folder = Path(temporary)
         wrong = cases(folder)
         answers = list(pool.map(lambda case: answer(case[0], folder, case[1]), wrong))
         lines = []
-        for k, (name, line) in zip(range(options.damaged), cycle(DAMAGED.items()), strict=False):
-            damaged = folder / f"damaged{k}{Path(name).suffix}"
+        for k, (name, line) in zip(range(damaged), cycle(DAMAGED.items()), strict=False):
+            file = folder / f"damaged{k}{Path(name).suffix}"
             content = damage((folder / name).read_bytes(), np.random.default_rng(k))
-            damaged.write_bytes(content)
+            file.write_bytes(content)
             # lists do not share a folder
-            lines.append(line.format(damaged.name).replace("--out out", f"--out out{k}"))
+            lines.append(line.format(file.name).replace("--out out", f"--out out{k}"))
         answers += pool.map(lambda line: answer(line, folder, None), lines)
     failures = [found for found in answers if "failure" in found]
     record = stamp() | {"cases": len(wrong), "damaged": len(lines)}
@@ -212,4 +207,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(main))

@@ -117,26 +117,26 @@ def measure(
     record("degrees_from_cpu", degrees(results[:few], rotations(expected)))
 
 
-def main() -> None:
-    parser = _shared.parser_of(__doc__)
-    parser.add_argument("--device", default="cuda")
-    parser.add_argument("--photographs", type=int, default=64)
-    parser.add_argument("--few-views", action="store_true", help="to try the script itself")
-    parser.add_argument("--out", type=Path, required=True)
-    options = parser.parse_args()
+def main(
+    *,
+    out: Path,
+    device: str = "cuda",
+    photographs: int = 64,
+    few_views: bool = False,
+) -> None:
     measured = {
         **_shared.stamp(),
-        "processor": _shared.processor(options.device),
+        "processor": _shared.processor(device),
         "torch": torch.__version__,
     }
 
     def record(name: str, value: Any) -> None:
         measured[name] = value
         print(name, json.dumps(value), flush=True)
-        _shared.write_json(options.out, measured)
+        _shared.write_json(out, measured)
 
-    measure(options.photographs, options.device, few_views=options.few_views, record=record)
+    measure(photographs, device, few_views=few_views, record=record)
 
 
 if __name__ == "__main__":
-    main()
+    _shared.run(main)

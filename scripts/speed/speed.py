@@ -29,7 +29,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from scripts import _shared
 
@@ -253,23 +253,21 @@ def cell(measurement: dict[str, float]) -> str:
     return "{seconds:.2f} s ({processor_seconds:.2f}), {megabytes:.0f} MB".format(**measurement)
 
 
-def main() -> None:
-    parser = _shared.parser_of(__doc__)
-    parser.add_argument(
-        "--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository"
-    )
-    parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS)
-    parser.add_argument("--photographs", type=int, default=16)
-    parser.add_argument("--rounds", type=int, default=3)
-    options = parser.parse_args()
-    checkouts = {"before": options.against.resolve()} if options.against else {}
+def main(
+    *,
+    against: Path | None = None,
+    steps: list[Literal[*STEPS]] = STEPS,
+    photographs: int = 16,
+    rounds: int = 3,
+) -> None:
+    checkouts = {"before": against.resolve()} if against else {}
     checkouts["now"] = ROOT
     record = {
         "date": _shared.today(),
         "commits": {name: _shared.commit(root) for name, root in checkouts.items()},
         "processor": _shared.processor(),
-        "photographs": options.photographs,
-        "times": compare(checkouts, options.steps, options.photographs, options.rounds),
+        "photographs": photographs,
+        "times": compare(checkouts, steps, photographs, rounds),
     }
     _shared.write_json(_shared.RESULTS / "speed.json", record)
     _shared.update_page(_shared.REPOSITORY / "docs" / "performance.md", "speed", table(record))
@@ -277,4 +275,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    _shared.run(main)

@@ -3,6 +3,8 @@ weights.
 
     python scripts/training/train_learned_field.py --out runs/field --minutes 90
 
+OUT gets weights and a log; --workers processes generate scenes for --minutes.
+
 A batch consists of fresh scenes and of earlier ones, with new colours and mirrored. The losses are
 those of field_dataset.py; one of them is backpropagated through HOG.
 """
@@ -26,7 +28,7 @@ from curvireg_torch.features.learned_field import save_weights
 from curvireg_torch.geometry import rotation_error, sample_views
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.describe import depth_filter, hog_layer
-from scripts._shared import parser_of
+from scripts._shared import run
 from scripts.training.field_dataset import SETTINGS, FieldDataset, ReplayBuffer, augment, losses
 from scripts.training.generated import GeneratedScenes
 
@@ -71,10 +73,10 @@ class Validation:
             cosines.append(float(F.cosine_similarity(query, target)))
         e = np.array(errors)
         return {
-            "accuracy_30": float((e < 30).mean()),
-            "accuracy_15": float((e < 15).mean()),
-            "median": float(np.median(e)),
-            "cosine": float(np.mean(cosines)),
+            "accuracy_30": (e < 30).mean(),
+            "accuracy_15": (e < 15).mean(),
+            "median": np.median(e),
+            "cosine": np.mean(cosines),
         }
 
 
@@ -90,46 +92,46 @@ def averaged(mean: Tensor, now: Tensor, step: Tensor) -> Tensor:
     return mean + (1 - keep) * (now - mean)
 
 
-def main() -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="folder of weights and log")
-    parser.add_argument("--minutes", type=float, default=90.0, help="training time")
-    parser.add_argument("--workers", type=int, default=1, help="processes that generate scenes")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    weights = options.out / "field.safetensors"
-    log = options.out / "log.jsonl"
+def main(
+    *,
+    out: Path,
+    minutes: float = 90.0,
+    workers: int = 1,
+    seed: int = 0,
+    device: str = "cuda" if torch.cuda.is_available() else "cpu",
+) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    weights = out / "field.safetensors"
+    log = out / "log.jsonl"
     log.unlink(missing_ok=True)
 
-    torch.manual_seed(options.seed)
+    torch.manual_seed(seed)
     network = FieldNetwork()
     average = AveragedModel(network, device="cpu", avg_fn=averaged, use_buffers=True)
     average.n_averaged.fill_(1)  # the first weights count
-    network.to(options.device, memory_format=torch.channels_last)
+    network.to(device, memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=0.02)
     validation = Validation()
     loader = DataLoader(
-        FieldDataset(GeneratedScenes(10**9, seed=options.seed)),
+        FieldDataset(GeneratedScenes(10**9, seed=seed)),
         FRESH,
-        num_workers=options.workers,
-        multiprocessing_context="spawn" if options.workers else None,
+        num_workers=workers,
+        multiprocessing_context="spawn" if workers else None,
     )
     replay = ReplayBuffer(REPLAY)
-    generator = torch.Generator().manual_seed(options.seed)
+    generator = torch.Generator().manual_seed(seed)
     means = Counter()
     start = time.monotonic()
-    minutes = 0.0
+    passed = 0.0  # minutes
     validated = 0.0
     for step, fresh in enumerate(loader):
         replay.add(fresh)
         batch = augment(replay.draw(FRESH, BATCH, generator), generator)
-        batch = {name: values.to(options.device) for name, values in batch.items()}
+        batch = {name: values.to(device) for name, values in batch.items()}
         for group in optimizer.param_groups:
-            group["lr"] = learning_rate(step, minutes / options.minutes)
+            group["lr"] = learning_rate(step, passed / minutes)
         network.train()
-        with torch.autocast(torch.device(options.device).type, torch.bfloat16):
+        with torch.autocast(torch.device(device).type, torch.bfloat16):
             output = network(batch["image"].contiguous(memory_format=torch.channels_last))
         parts = losses(output.float(), batch)
         optimizer.zero_grad(set_to_none=True)
@@ -139,11 +141,11 @@ def main() -> None:
         average.update_parameters(network)
         means.update({name: float(value.detach()) for name, value in parts.items()})
         means["steps"] += 1
-        minutes = (time.monotonic() - start) / 60
-        if minutes - validated <= EVERY and minutes < options.minutes:
+        passed = (time.monotonic() - start) / 60
+        if passed - validated <= EVERY and passed < minutes:
             continue
         steps = means.pop("steps")
-        entry = {"step": step + 1, "minutes": minutes, "scenes": (step + 1) * FRESH}
+        entry = {"step": step + 1, "minutes": passed, "scenes": (step + 1) * FRESH}
         entry |= {name: value / steps for name, value in means.items()}
         entry |= validation(average.module.eval())
         entry = {name: round(value, 4) for name, value in entry.items()}
@@ -152,11 +154,11 @@ def main() -> None:
             lines.write(json.dumps(entry) + "\n")
         print(json.dumps(entry), flush=True)
         means.clear()
-        validated = minutes
-        if minutes >= options.minutes:
+        validated = passed
+        if passed >= minutes:
             break
     print(f"weights: {weights}")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

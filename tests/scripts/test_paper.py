@@ -19,6 +19,7 @@ from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from scripts._shared import commit, read_json, read_lines
+from scripts._shared import run as run_script
 from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
@@ -239,7 +240,7 @@ def test_classes_stand_beside_the_papers():
 
 def run(monkeypatch, *words):
     monkeypatch.setattr(sys, "argv", ["reproduce_paper.py", *map(str, words)])
-    return reproduce_paper.main()
+    run_script(reproduce_paper.main)
 
 
 def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
@@ -256,7 +257,7 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
         "--page",
         page,
     ]
-    assert run(monkeypatch, *words) == 0
+    run(monkeypatch, *words)
     text = (tmp_path / "repeatability.md").read_text()
     assert "N = 2 (1 CADs)" in text
     assert text in page.read_text()
@@ -266,8 +267,8 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     monkeypatch.setattr(
         reproduce_paper, "measure", Mock(side_effect=AssertionError("measured again"))
     )
-    assert run(monkeypatch, *words) == 0
-    assert run(monkeypatch, "curve", *words[1:]) == 0
+    run(monkeypatch, *words)
+    run(monkeypatch, "curve", *words[1:])
     assert (tmp_path / reproduce_paper.CURVE).stat().st_size > 1000
     assert "(images/paper-curve.webp)" in page.read_text()
     assert (tmp_path / "images" / "paper-curve.webp").stat().st_size > 1000
@@ -281,7 +282,8 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
 def test_a_missing_package_is_named(root, tmp_path, monkeypatch, capsys, module, package):
     find_spec = util.find_spec
     monkeypatch.setattr(util, "find_spec", lambda name: None if name == module else find_spec(name))
-    assert run(monkeypatch, "curve", "web", root, "--out", tmp_path) == 2
+    with pytest.raises(SystemExit, match="2"):
+        run(monkeypatch, "curve", "web", root, "--out", tmp_path)
     assert (
         f"{package} is not installed; pip install 'curvireg_torch[paper]'"
         in capsys.readouterr().err
@@ -296,7 +298,7 @@ def test_scripts_run_beside_an_installed_package(name, tmp_path):
         [sys.executable, "-I", str(script), "--help"], cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    assert "--out DIR" in done.stdout
+    assert "--out OUT" in done.stdout
 
 
 @pytest.mark.parametrize("pose", ["any", "upright"])
@@ -324,12 +326,12 @@ def test_the_staircase_shows_intervals_of_three_cads_and_what_is_known():
 
 def climb(monkeypatch, out, *words):
     monkeypatch.setattr(sys, "argv", ["staircase.py", *map(str, words), "--out", str(out)])
-    return staircase.main()
+    run_script(staircase.main)
 
 
 def test_steps_are_evaluated_once(pascal, tmp_path, monkeypatch, capsys):
     words = [f"mini={pascal.root}", "--steps", "0"]
-    assert climb(monkeypatch, tmp_path, *words) == 0
+    climb(monkeypatch, tmp_path, *words)
     output = capsys.readouterr()
     assert "unreadable_image" in output.err
     summary = read_json(tmp_path / "mini" / "0" / "summary.json")
@@ -342,9 +344,10 @@ def test_steps_are_evaluated_once(pascal, tmp_path, monkeypatch, capsys):
     fail = Mock(side_effect=AssertionError("registered again"))
     with monkeypatch.context() as patch:
         patch.setattr("curvireg_torch.evaluation.datasets.cached_bank", fail)
-        assert climb(monkeypatch, tmp_path, *words) == 0
+        climb(monkeypatch, tmp_path, *words)
     assert line in capsys.readouterr().out
-    assert climb(monkeypatch, tmp_path, "nothing") == 2
+    with pytest.raises(SystemExit, match="2"):
+        climb(monkeypatch, tmp_path, "nothing")
 
 
 def test_objects_without_a_pose_count_as_wrong(pascal, tmp_path, monkeypatch, capsys):
@@ -359,7 +362,7 @@ def test_objects_without_a_pose_count_as_wrong(pascal, tmp_path, monkeypatch, ca
     found.errors = dict(zip(keys, found.errors.values(), strict=False))
     monkeypatch.setattr(staircase, "evaluate", lambda *_, **__: {"skipped": {}})
     monkeypatch.setattr(staircase, "read_run", lambda _: found)
-    assert climb(monkeypatch, tmp_path, f"mini={pascal.root}", "--steps", "3") == 0
+    climb(monkeypatch, tmp_path, f"mini={pascal.root}", "--steps", "3")
     text = capsys.readouterr().out
     assert "`mini`, N 2" in text
     assert "| 0.50, 104° |" in text

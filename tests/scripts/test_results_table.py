@@ -44,7 +44,7 @@ def results(tmp_path, monkeypatch):
 
 
 def test_recorded_summary_becomes_a_row_of_the_table(tmp_path, results):
-    path = results_table.record(write_summary(tmp_path / "run"), "cups")
+    path = results_table.store(write_summary(tmp_path / "run"), "cups")
     stored = json.loads(path.read_text())
     assert path == results / "evaluation_cups.json"
     assert (stored["name"], stored["summary"]["n"]) == ("cups", 8)
@@ -58,7 +58,7 @@ def test_recorded_summary_becomes_a_row_of_the_table(tmp_path, results):
 
 def test_the_table_in_words_names_what_a_set_shows(tmp_path, results):
     for name in ("lego", "buddha", "cups"):
-        results_table.record(write_summary(tmp_path / name), name)
+        results_table.store(write_summary(tmp_path / name), name)
     sets = [{"name": "buddha", "reliable": 5, "reliable_right": 4}]
     (results / "confidence.json").write_text(json.dumps({"sets": sets}))
     lines = results_table.table_in_words(results).splitlines()
@@ -72,7 +72,7 @@ def test_the_table_in_words_names_what_a_set_shows(tmp_path, results):
 
 def test_followed_frames_are_a_row_before_the_last(tmp_path, results):
     for name in ("lego", "pascal3d_mini"):
-        results_table.record(write_summary(tmp_path / name), name)
+        results_table.store(write_summary(tmp_path / name), name)
     videos = [
         {"errors_deg": [1.0, 31.0], "verdicts": ["reliable", "reliable"]},
         {"errors_deg": [3.0, float("inf"), 2.0], "verdicts": ["reliable", "lost", "unsure"]},
@@ -86,13 +86,13 @@ def test_followed_frames_are_a_row_before_the_last(tmp_path, results):
 
 
 def test_sets_of_several_lightings_count_views(tmp_path, results):
-    results_table.record(write_summary(tmp_path / "run"), "hope")
+    results_table.store(write_summary(tmp_path / "run"), "hope")
     assert "| hope | 8 |" in results_table.table(results)  # 8 is no multiple of 5
     assert results_table.counted("hope", 10) == "10 (2 views x 5 lightings)"
 
 
 def test_comparison_shows_stored_and_new_scores(tmp_path, results):
-    results_table.record(write_summary(tmp_path / "old" / "cups"), "cups")
+    results_table.store(write_summary(tmp_path / "old" / "cups"), "cups")
     new = write_summary(tmp_path / "new" / "cups", acc_15_deg=0.625, med_err_deg=None)
     text = results_table.comparison([new], results)
     assert "| cups | 8 | acc_15_deg | 50.0 % | 62.5 % |" in text
