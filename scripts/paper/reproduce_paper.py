@@ -28,7 +28,6 @@ with the commit, into a page.
 
 import shutil
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -91,10 +90,8 @@ def measure(
     """Records of the cases of one mesh."""
     from scripts.paper.measure import MEASURES
 
-    start = time.process_time()
     found = MEASURES[phase](cases, settings, pose)
-    seconds = (time.process_time() - start) / len(cases)
-    same = {"cad": cases[0].mesh_path, "seconds": seconds, "commit": commit()}
+    same = {"cad": cases[0].mesh_path, "commit": commit()}
     return [
         {"category": case.category, **same, **record}
         for case, record in zip(cases, found, strict=True)

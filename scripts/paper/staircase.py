@@ -33,52 +33,46 @@ from scripts.paper.measures import Estimate, bootstrap
 FEWEST_CADS = 3  # for an interval
 
 
-class Step(NamedTuple):
-    """One change: what it is, and how it turns the pipeline of the step before into its own, for a
-    dataset of which the pose is known."""
-
-    name: str
-    change: Callable[[Pipeline, str], Pipeline]
-
-
 def _bank(**changes: str) -> Callable[[Pipeline, str], Pipeline]:
     return lambda pipeline, _: replace(pipeline, bank=replace(pipeline.bank, **changes))
 
 
 STEPS = (
-    Step("the paper to the letter", lambda _, __: PRESETS["paper"]),
-    Step(
+    ("the paper to the letter", lambda _, __: PRESETS["paper"]),
+    (
         "views in the mesh's own axes, not the principal ones",
         lambda p, _: replace(p, views=ViewPolicy("paper")),
     ),
-    Step("S_rep monotone", lambda p, _: p.with_term("repeatability", mode="monotone")),
-    Step(
+    ("S_rep monotone", lambda p, _: p.with_term("repeatability", mode="monotone")),
+    (
         "CS along the eigenvector of the larger \\|eigenvalue\\|, not of the larger one",
         _bank(formula="paper-length"),
     ),
-    Step("CS = κ1 - κ2, not \\|∇Z\\| √(tr² - 4 det)", _bank(formula="geometric")),
-    Step("S_hog a cosine, not (D - μ)ᵀ Σ⁻¹ D", lambda p, _: p.with_term("hog", whitening="none")),
-    Step("focus curves by the exact blur, weighted by CS", lambda p, _: replace(p, field="focus")),
-    Step("perspective views", _bank(camera="perspective")),
-    Step("more views, at one distance", lambda p, pose: replace(p, views=ViewPolicy(pose))),
-    Step("no search", lambda p, _: replace(p, search=False)),
-    Step("shape of the box", lambda p, _: replace(p, terms=(*p.terms, BoxShape()))),
-    Step("box jitter", lambda p, _: replace(p, box_jitter=0.1)),
-    Step("learned field", lambda p, _: replace(p, field="learned")),
-    Step("appearance", lambda p, _: replace(p, terms=(*p.terms, Appearance()))),
-    Step(
+    ("CS = κ1 - κ2, not \\|∇Z\\| √(tr² - 4 det)", _bank(formula="geometric")),
+    ("S_hog a cosine, not (D - μ)ᵀ Σ⁻¹ D", lambda p, _: p.with_term("hog", whitening="none")),
+    ("focus curves by the exact blur, weighted by CS", lambda p, _: replace(p, field="focus")),
+    ("perspective views", _bank(camera="perspective")),
+    ("more views, at one distance", lambda p, pose: replace(p, views=ViewPolicy(pose))),
+    ("no search", lambda p, _: replace(p, search=False)),
+    ("shape of the box", lambda p, _: replace(p, terms=(*p.terms, BoxShape()))),
+    ("box jitter", lambda p, _: replace(p, box_jitter=0.1)),
+    ("learned field", lambda p, _: replace(p, field="learned")),
+    ("appearance", lambda p, _: replace(p, terms=(*p.terms, Appearance()))),
+    (
         "contour fit of five hypotheses: the default",
         lambda p, _: replace(p, hypotheses=5, contours=True),
     ),
 )
+"""Of each step: what changes, and how it turns the pipeline of the step before into its own, for a
+dataset of which a pose is known."""
 
 
 def pipelines(pose: str) -> Iterator[tuple[str, Pipeline]]:
     """The name of each step and its pipeline, for a dataset of which ``pose`` is known."""
     pipeline = PRESETS["paper"]
-    for k, step in enumerate(STEPS):
-        pipeline = step.change(pipeline, pose)
-        yield f"{k}. {step.name}", pipeline
+    for k, (name, change) in enumerate(STEPS):
+        pipeline = change(pipeline, pose)
+        yield f"{k}. {name}", pipeline
 
 
 def benchmark_of(root: Path) -> Benchmark:

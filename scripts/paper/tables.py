@@ -56,12 +56,12 @@ class Table:
         return f"### {self.title}\n\n{self.definition}\n\n{table}"
 
 
+@dataclass(frozen=True)
 class Records:
-    """The records of photographs, with category and CAD."""
+    """The records of photographs, with category and CAD, and ``what`` they are measured on."""
 
-    def __init__(self, records: Sequence[dict[str, Any]], what: str) -> None:
-        self.records = records
-        self.what = what
+    records: Sequence[dict[str, Any]]
+    what: str
 
     def mean(self, value: Value) -> Estimate:
         """Mean of the finite values of all photographs."""

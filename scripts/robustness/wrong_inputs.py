@@ -36,6 +36,9 @@ from scripts._shared import RESULTS, read_json, run, stamp, write_json
 SECONDS = 20.0
 MEGABYTES = 4000
 
+GIVEN = Path(__file__).with_name("given")
+"""A folder of files of which most are wrong."""
+
 GOOD = Path(__file__).with_name("good")
 """A folder of good cameras, lists and poses."""
 
@@ -104,6 +107,8 @@ def write_files(folder: Path) -> None:
     import curvireg_torch as cr
     from curvireg_torch.synthetic import demo_scene, example_mesh
 
+    shutil.copytree(GIVEN, folder, dirs_exist_ok=True)
+    shutil.copy(GOOD / "camera.json", folder)
     write_picture(folder / "photo.png", demo_scene().image)
     cv2.imwrite(str(folder / "photo.jpg"), cv2.imread(str(folder / "photo.png")))
     cv2.imwrite(str(folder / "flat.png"), np.full((60, 80, 3), 90, np.uint8))
@@ -113,20 +118,13 @@ def write_files(folder: Path) -> None:
     cr.ViewBank.build(example_mesh(), views, image_size=32, progress=False).save(
         folder / "truck.safetensors"
     )
-    shutil.copy(GOOD / "camera.json", folder)
-    (folder / "photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.png,30,25,210,160\n")
-    for name in ("text.jpg", "text.obj", "truck.step"):
-        (folder / name).write_text("not what the name says")
-    (folder / "empty.png").touch()
     for name in ("empty", "0001"):
         (folder / name).mkdir()
     for name in ("photo.png", "truck.ply", "truck.safetensors"):
         data = (folder / name).read_bytes()
         half = folder / f"cut{Path(name).suffix}"
         half.write_bytes(data[: len(data) // 2])
-    (folder / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     trimesh.PointCloud(np.random.default_rng(0).normal(size=(5, 3))).export(folder / "points.ply")
-    (folder / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
 
 
 def limited() -> None:

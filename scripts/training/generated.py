@@ -1,7 +1,7 @@
 """Generated scenes as a dataset: crops of procedural objects, with the depth of the object
 alone."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -22,6 +22,7 @@ MARGIN = 0.1  # around the object's box, as in BankSettings
 SIZE = 128  # side of the crops in px
 
 
+@dataclass(frozen=True)
 class GeneratedScenes(Dataset[dict[str, Tensor]]):
     """Photograph-like crops of objects among clutter. Sample i depends only on ``seed`` and i.
 
@@ -35,26 +36,25 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
     object, ``distance`` () float32 in radii.
     """
 
-    def __init__(self, length: int, *, seed: int = 0, upright: float = 0.6) -> None:
-        self._length = length
-        self._seed = seed
-        self._upright = upright
+    length: int
+    seed: int = 0
+    upright: float = 0.6
 
     def __len__(self) -> int:
-        return self._length
+        return self.length
 
     def mesh(self, index: int) -> trimesh.Trimesh:
         """The object of sample ``index``, of radius 1 around the origin."""
-        vertices, faces, _ = random_shape(np.random.default_rng((self._seed, index)))
+        vertices, faces, _ = random_shape(np.random.default_rng((self.seed, index)))
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         return mesh.apply_scale(1.0 / np.linalg.norm(0.5 * mesh.extents))
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
-        if not 0 <= index < self._length:
+        if not 0 <= index < self.length:
             raise IndexError(index)
-        rng = np.random.default_rng((self._seed, index, 1))
-        shape = _painted(np.random.default_rng((self._seed, index)), rng)
-        upright = rng.random() < self._upright
+        rng = np.random.default_rng((self.seed, index, 1))
+        shape = _painted(np.random.default_rng((self.seed, index)), rng)
+        upright = rng.random() < self.upright
         occluded = rng.random() < 0.3
         scene = single(shape, 1, _clutter, random_texture, rng, upright=upright, occluded=occluded)
         R, t, _ = scene.views[0]
