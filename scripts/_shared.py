@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, TypeAlias, get_args, get_origin
 
 from tqdm import tqdm
 
@@ -18,6 +18,9 @@ from curvireg_torch.formats.meshes.files import mesh_digest
 from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.utils.executors import Workers
 from curvireg_torch.utils.files import file_digest, text_digest, write_file
+
+Record: TypeAlias = dict[str, Any]
+"""A row, or what a file of JSON holds."""
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RESULTS = REPOSITORY / "scripts" / "results"
@@ -51,7 +54,7 @@ def run(main: Callable[..., Any]) -> Any:
         parser.error(str(error))
 
 
-def _argument(kind: Any) -> dict[str, Any]:
+def _argument(kind: Any) -> Record:
     """What argparse has to know of an argument of a type."""
     origin = get_origin(kind)
     parts = get_args(kind)
@@ -156,7 +159,7 @@ def _of_item(function: Callable[[Any], Any], item: tuple[str, Any]) -> Any:
     return function(item[1])
 
 
-def stamp() -> dict[str, Any]:
+def stamp() -> Record:
     """The first entries of a record: when it was measured, and of which checkout."""
     return {"date": today(), "commit": commit()}
 

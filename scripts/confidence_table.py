@@ -11,7 +11,6 @@ table is written from it.
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 from sklearn.metrics import roc_auc_score
 
@@ -21,6 +20,7 @@ from scripts._shared import (
     REPOSITORY,
     RESULTS,
     RIGHT_DEG,
+    Record,
     markdown_table,
     read_json,
     read_lines,
@@ -48,15 +48,13 @@ def main(folders: list[Path] = ()) -> None:
         update_page(page, "confidence", table(rows))
 
 
-def merged(
-    stored: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]]
-) -> list[Mapping[str, Any]]:
+def merged(stored: Sequence[Record], rows: Sequence[Record]) -> list[Record]:
     """The stored rows, of which new ones of the same name take the place, then the other new
     ones."""
     return list({row["name"]: row for row in [*stored, *rows]}.values())
 
 
-def measured(folder: Path) -> dict[str, Any]:
+def measured(folder: Path) -> Record:
     """What the confidences of one run are worth; objects without a pose count as wrong, with
     confidence 0."""
     results = {row["key"]: row for row in read_lines(folder / "results.jsonl")}
@@ -81,7 +79,7 @@ def measured(folder: Path) -> dict[str, Any]:
     }
 
 
-def generated_part(calibration: Mapping[str, Any]) -> str:
+def generated_part(calibration: Record) -> str:
     """Markdown, of what calibrate.py recorded: all photographs in a sentence, then the table of the
     sets."""
     quality = calibration["held out"]["instance"]
@@ -105,7 +103,7 @@ def generated_part(calibration: Mapping[str, Any]) -> str:
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
-def table_of_generated(sets: Mapping[str, dict[str, Any]]) -> str:
+def table_of_generated(sets: Mapping[str, Record]) -> str:
     """Markdown, of the quality of confidences by set of generated photographs."""
     header = "photographs | N | mean confidence | right | reliable | wrong of these | AUC"
     cells = [header.split(" | ")]
@@ -117,7 +115,7 @@ def table_of_generated(sets: Mapping[str, dict[str, Any]]) -> str:
     return markdown_table(cells)
 
 
-def table_of_withheld(sets: Mapping[str, dict[str, Any]]) -> str:
+def table_of_withheld(sets: Mapping[str, Record]) -> str:
     """Markdown, of the same generated photographs with their cameras and without."""
     cells = [["set", "N", "within 5°: given, none", "within 15°", "median"]]
     for name in ("shapes", "packages"):
@@ -130,7 +128,7 @@ def table_of_withheld(sets: Mapping[str, dict[str, Any]]) -> str:
     return markdown_table(cells)
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
+def table(rows: Sequence[Record]) -> str:
     """Markdown, of the quality of confidences by real set."""
     header = "set | N | mean confidence | right | reliable | of these right | ambiguous | AUC"
     cells = [header.split(" | ")]

@@ -12,17 +12,17 @@ A stored summary contains the date and the commit at which it was recorded ("+":
 changes), so record it right after measuring.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import reduce
 from operator import getitem
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from scripts._shared import (
     REPOSITORY,
     RESULTS,
     RIGHT_DEG,
+    Record,
     markdown_table,
     read_json,
     run,
@@ -86,7 +86,7 @@ def score(value: float | None, key: str) -> str:
     return degrees(value) if key.endswith("_err_deg") else percent(value)
 
 
-def stored_records(results: Path) -> list[dict[str, Any]]:
+def stored_records(results: Path) -> list[Record]:
     """The stored summaries, by name."""
     paths = sorted(results.glob("evaluation_*.json"))
     return [read_json(path) for path in paths]
@@ -116,12 +116,12 @@ def table_in_words(results: Path) -> str:
     return f"{markdown_table(rows)}\nCommit {', '.join(sorted(commits))}.\n"
 
 
-def stored(path: Path) -> dict[str, Any]:
+def stored(path: Path) -> Record:
     """A record, empty if there is none."""
     return read_json(path) if path.exists() else {}
 
 
-def video_row(videos: Sequence[Mapping[str, Any]]) -> list[object]:
+def video_row(videos: Sequence[Record]) -> list[object]:
     """The row of the frames that scripts/videos.py followed."""
     errors = [error for video in videos for error in video["errors_deg"]]
     verdicts = [verdict for video in videos for verdict in video["verdicts"]]
@@ -156,7 +156,7 @@ def table(results: Path) -> str:
     return "\n".join(parts)
 
 
-def cells(record: dict[str, Any], columns: Sequence[Sequence[str]]) -> Iterator[str]:
+def cells(record: Record, columns: Sequence[Sequence[str]]) -> Iterator[str]:
     """The scores of a set; keys within others are parted by slashes."""
     for _, keys in columns:
         *outer, key = keys.split("/")
@@ -164,7 +164,7 @@ def cells(record: dict[str, Any], columns: Sequence[Sequence[str]]) -> Iterator[
         yield counted(record["name"], value) if keys == "n" else score(value, key)
 
 
-def note(record: dict[str, Any]) -> str:
+def note(record: Record) -> str:
     """Conditions under which one line was measured."""
     summary = record["summary"]
     settings = summary["settings"]

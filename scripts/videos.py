@@ -9,7 +9,6 @@ first frame is that of the true pose. Errors are up to the symmetries of the sha
 
 import json
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -18,7 +17,7 @@ from curvireg_torch.data import read_image
 from curvireg_torch.evaluation.metrics import symmetric_rotation_error
 from curvireg_torch.geometry import projected_boxes, transform
 from curvireg_torch.registration import Follower
-from scripts._shared import RESULTS, read_json, run, stamp, write_json
+from scripts._shared import RESULTS, Record, read_json, run, stamp, write_json
 
 
 def main(folders: list[Path], *, record: bool = False) -> None:
@@ -28,7 +27,7 @@ def main(folders: list[Path], *, record: bool = False) -> None:
         write_json(RESULTS / "videos.json", stamp() | {"videos": videos})
 
 
-def followed(folder: Path) -> dict[str, Any]:
+def followed(folder: Path) -> Record:
     """Name of a video; of its frames errors in degrees, inf without a pose, and verdicts."""
     values = read_json(folder / "camera.json")
     K = cr.camera_matrix(*(values[name] for name in ("fx", "fy", "cx", "cy")))

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -36,7 +36,7 @@ from scipy.spatial.distance import pdist
 
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.mesh import mesh_symmetries
-from scripts._shared import in_processes, read_json, run, write_json
+from scripts._shared import Record, in_processes, read_json, run, write_json
 from scripts.scenes.families import FAMILIES, random_shape
 from scripts.scenes.materials import random_texture
 from scripts.scenes.packages import package
@@ -297,7 +297,7 @@ KINDS = {
 }
 
 
-def model_row(objects: Packages, folder: Path, obj_id: int) -> dict[str, Any]:
+def model_row(objects: Packages, folder: Path, obj_id: int) -> Record:
     """Write the model of an object, a PLY file in mm with one texture, unless it exists; its row of
     models_info."""
     mesh = objects.mesh(obj_id)
@@ -439,7 +439,7 @@ def make_scene(objects: Packages, options: Namespace, index: int) -> None:
     part.rename(folder)
 
 
-def camera_row(scene: Scene, view: View) -> dict[str, Any]:
+def camera_row(scene: Scene, view: View) -> Record:
     """A view in ``scene_camera.json``."""
     R, t, K = view
     mm = 1000.0 / scene.annotated[0].scale
@@ -451,7 +451,7 @@ def camera_row(scene: Scene, view: View) -> dict[str, Any]:
     }
 
 
-def truth_row(shape: Placed, view: View, annotated: Annotated) -> dict[str, Any]:
+def truth_row(shape: Placed, view: View, annotated: Annotated) -> Record:
     """An object of a view in ``scene_gt.json``."""
     R, t, _ = view
     obj_id, mesh = annotated[shape.obj_id]
@@ -464,7 +464,7 @@ def truth_row(shape: Placed, view: View, annotated: Annotated) -> dict[str, Any]
     }
 
 
-def info_row(seen: Array, whole: Array) -> dict[str, Any]:
+def info_row(seen: Array, whole: Array) -> Record:
     """An object of a view in ``scene_gt_info.json``, by its masks with the others and without."""
     count = int(whole.sum())
     visible = int(seen.sum())

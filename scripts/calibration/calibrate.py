@@ -24,9 +24,9 @@ from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from curvireg_torch.registration.confidence import RELIABLE
-from scripts._shared import REPOSITORY, RESULTS, read_json, run, stamp, write_json
+from scripts._shared import REPOSITORY, RESULTS, Record, read_json, run, stamp, write_json
 from scripts.calibration.fits import first_probability, fit_logistic, fit_registrations
-from scripts.calibration.measure import Row, rows_of
+from scripts.calibration.measure import rows_of
 from scripts.calibration.sets import KINDS, MODELS, render_sets, sets_of
 
 LEVELS = (0.5, 0.9)  # of ellipsoids whose coverage is measured
@@ -38,11 +38,11 @@ def calibrate(
     jobs: int,
     models: Sequence[str],
     meshes: Path | None,
-) -> tuple[Row, Row]:
+) -> tuple[Record, Record]:
     """Constants, those of other ``models`` as they were, and quality of the new ones on held-out
     kinds of objects."""
-    constants: Row = read_json(CONSTANTS)
-    quality: Row = {}
+    constants: Record = read_json(CONSTANTS)
+    quality: Record = {}
     for name in models:
         if name in KINDS:
             rows = rows_of(work, KINDS[name], jobs)
@@ -57,7 +57,7 @@ def calibrate(
     return constants, quality
 
 
-def covariance_quality(distances: ArrayLike, scale: float) -> Row:
+def covariance_quality(distances: ArrayLike, scale: float) -> Record:
     """What covariances are worth, from squared Mahalanobis distances (n,) of reliable and right
     poses to the truth: shares within the ellipsoids of 50 % and 90 %, and the ``covariance_scale``
     with which 90 % would lie within the latter."""

@@ -16,8 +16,7 @@ from curvireg_torch.registration.confidence import (
     LogisticModel,
 )
 from curvireg_torch.registration.mirror_image import MIRROR_DOUBT
-from scripts._shared import RIGHT_DEG
-from scripts.calibration.measure import Row
+from scripts._shared import RIGHT_DEG, Record
 from scripts.calibration.sets import SETS
 
 FOLDS = 5
@@ -25,7 +24,7 @@ RESOLUTIONS = np.arange(0.5, 1.55, 0.1).round(2).tolist()
 """Those that are tried. Scores of two poses that look the same differ by up to 0.5."""
 
 
-def folds_of(rows: Sequence[Row]) -> np.ndarray:
+def folds_of(rows: Sequence[Record]) -> np.ndarray:
     """(n,) fold of each row; groups are assigned so that folds have about equal sizes."""
     groups, member, counts = np.unique(
         [row["group"] for row in rows], return_inverse=True, return_counts=True
@@ -38,7 +37,7 @@ def folds_of(rows: Sequence[Row]) -> np.ndarray:
     return fold[member]
 
 
-def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, float]) -> Row:
+def fit_logistic(rows: Sequence[Record], weight: np.ndarray, signs: Mapping[str, float]) -> Record:
     """Weights and bias of the probability that a row is ``right``.
 
     The standardised weights have a unit Gaussian prior, and the sign in ``signs``, if there is one.
@@ -70,7 +69,7 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
     return {"weights": weights, "bias": round(bias, 4), "n": len(y)}
 
 
-def fit_level(rows: Sequence[Row], weight: np.ndarray, constants: Row) -> Row:
+def fit_level(rows: Sequence[Record], weight: np.ndarray, constants: Record) -> Record:
     """The model of ``constants`` with a scale and a level of its logit, so that the confidence of
     the first hypothesis, its share included, is right: two numbers, which few photographs
     determine. Slope and resolution of the shares stay."""
@@ -90,14 +89,14 @@ def fit_level(rows: Sequence[Row], weight: np.ndarray, constants: Row) -> Row:
     return constants | {"weights": weights, "bias": bias, "n": len(rows)}
 
 
-def row_logit(row: Row, constants: Row) -> float:
+def row_logit(row: Record, constants: Record) -> float:
     """Logit of the probability that any hypothesis of a row is right."""
     features = row["features"]
     terms = [weight * (features[name] or 0.0) for name, weight in constants["weights"].items()]
     return constants["bias"] + sum(terms)
 
 
-def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
+def fit_shares(rows: Sequence[Record], weight: np.ndarray, *, ties: bool) -> Record:
     """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some
     pose is right and some are not; without ``ties`` the resolution is 0."""
     decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT_DEG]
@@ -124,21 +123,21 @@ def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
     return {"slope": slope, "resolution": resolution}
 
 
-def first_probability(row: Row, constants: Row) -> float:
+def first_probability(row: Record, constants: Record) -> float:
     """Confidence of a row."""
     any_right = LogisticModel(constants["weights"], constants["bias"])(row["features"])
     doubt = MIRROR_DOUBT if row.get("mirror") else 1.0
     return doubt * any_right * first_share(row, constants)
 
 
-def first_share(row: Row, constants: Row) -> float:
+def first_share(row: Record, constants: Record) -> float:
     """Share of the first hypothesis in the probability that any is right."""
     scores = np.array(row["scores"])
     logits = -constants["slope"] * np.maximum(0.0, scores.max() - scores - constants["resolution"])
     return np.exp(logits[0] - logsumexp(logits))
 
 
-def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
+def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Record:
     """How well probabilities (n,) tell the right answers (n,) bool."""
     sure = p >= RELIABLE
 
@@ -157,7 +156,7 @@ def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
     }
 
 
-def errors_within(errors: np.ndarray) -> Row:
+def errors_within(errors: np.ndarray) -> Record:
     """Fractions of errors (n,) in degrees within 5 and 15, and their median."""
     within = {f"within {limit}": (errors < limit).mean() for limit in (5, 15)}
     return within | {"median": np.median(errors)}
@@ -175,7 +174,7 @@ def weights_of(sets: np.ndarray) -> np.ndarray:
     return weight
 
 
-def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
+def fit_registrations(rows: list[Record], *, exact: bool) -> tuple[Record, Record]:
     """Constants of a model of registrations, and their quality on held-out folds, in all and by
     set."""
     for row in rows:
@@ -186,7 +185,7 @@ def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
     weight = weights_of(sets)
     signs = dict.fromkeys(EVIDENCE_FEATURES, 1.0) | dict.fromkeys(DOUBT_FEATURES, -1.0)
 
-    def fit(train: np.ndarray) -> Row:
+    def fit(train: np.ndarray) -> Record:
         # what fits, but is less probable than the mirror image, tells nothing of what fits
         train = train & ~is_mirrored
         some = [rows[k] for k in np.flatnonzero(train)]

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -30,10 +29,8 @@ from curvireg_torch.mesh import Mesh
 from curvireg_torch.registration import Follower
 from curvireg_torch.registration.confidence import are_near
 from curvireg_torch.registration.mirror_image import MIRROR_WARNING
-from scripts._shared import RIGHT_DEG, measured, read_json, request_digest
+from scripts._shared import RIGHT_DEG, Record, measured, read_json, request_digest
 from scripts.calibration.sets import photographs_of, set_of
-
-Row: TypeAlias = dict[str, Any]
 
 # and fraction of the distance, within which a refined or tracked pose is right
 FINE_DEGREES = 10.0
@@ -52,7 +49,7 @@ STARTS = (
 """Degrees and fraction of the distance by which the starts of refinements are off."""
 
 
-def symmetries_of(sample: Row, registrar: cr.Registrar | None = None) -> Tensor:
+def symmetries_of(sample: Record, registrar: cr.Registrar | None = None) -> Tensor:
     """(S, 3, 3) rotations after which the object counts as the same: those of the set, and those
     that an exact mesh without colours has for the registrar, unless a notable feature of it tells
     them apart."""
@@ -64,25 +61,25 @@ def symmetries_of(sample: Row, registrar: cr.Registrar | None = None) -> Tensor:
     return known[:, :3, :3]
 
 
-def errors_of(R: Tensor, sample: Row, S: Tensor | None = None) -> Tensor:
+def errors_of(R: Tensor, sample: Record, S: Tensor | None = None) -> Tensor:
     """(N,) degrees between rotations (N, 3, 3) and the truth, up to symmetries ``S`` (S, 3, 3)."""
     S = symmetries_of(sample) if S is None else S
     return symmetric_rotation_error(R.double(), sample["rotation"].double(), S)
 
 
-def truth_of(sample: Row) -> Tensor:
+def truth_of(sample: Record) -> Tensor:
     """(4, 4) true pose of a sample."""
     return transform(sample["rotation"].double(), sample["translation"].double())
 
 
-def fine(T: Tensor, sample: Row) -> bool:
+def fine(T: Tensor, sample: Record) -> bool:
     """Whether a pose (4, 4) is near the truth."""
     t = sample["translation"].double()
     near = (T[:3, 3] - t).norm() <= FINE_FRACTION * t.norm()
     return bool(near and errors_of(T[None, :3, :3], sample) <= FINE_DEGREES)
 
 
-def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> Iterator[Row]:
+def registered(registrar: cr.Registrar, sample: Record, *, with_camera: bool) -> Iterator[Record]:
     """One row: features, scores and errors of the hypotheses."""
     K = sample["camera_matrix"].double() if with_camera else None
     result = registrar([sample["image"]], sample["box"][None], K)[0]
@@ -117,14 +114,14 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
     yield row
 
 
-def true_centre(sample: Row) -> Tensor:
+def true_centre(sample: Record) -> Tensor:
     """(3,) middle of the model's box at the true pose, in mm."""
     info = sample["model_info"]
     middle = [info[f"min_{c}"] + 0.5 * info[f"size_{c}"] for c in "xyz"]
     return point_in_cameras(truth_of(sample), torch.tensor(middle, dtype=torch.float64))
 
 
-def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
+def refined(registrar: cr.Registrar, sample: Record, other: Record) -> Iterator[Record]:
     """Rows of refinements from wrong starts, and in the photograph ``other``, which does not show
     the object."""
     T = truth_of(sample)
@@ -144,7 +141,7 @@ def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
             }
 
 
-def followed(registrar: cr.Registrar, frames: Sequence[Row]) -> Iterator[Row]:
+def followed(registrar: cr.Registrar, frames: Sequence[Record]) -> Iterator[Record]:
     """Rows of a sequence tracked from its first true pose, by every frame and by every third."""
     for stride in (1, 3):
         follow = Follower(registrar, frames[0]["camera_matrix"].double())
@@ -158,7 +155,7 @@ def followed(registrar: cr.Registrar, frames: Sequence[Row]) -> Iterator[Row]:
                 }
 
 
-def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
+def detected(registrar: cr.Registrar, sample: Record, other: Record) -> Iterator[Record]:
     """Rows of detections without a box, in a photograph of the object and in one without it."""
     for shown in (sample, other):
         result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
@@ -192,7 +189,7 @@ def mesh_of(path: Path, *, grey: bool) -> Mesh:
     return replace(mesh, colours=None) if grey else mesh
 
 
-def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
+def measure(task: tuple[str, Path, str, list[int], int]) -> list[Record]:
     """Rows of one mesh's photographs."""
     kind, folder, pose, indices, beside = task
     torch.set_num_threads(1)
@@ -228,7 +225,7 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     return rows
 
 
-def rows_of(work: Path, kind: str, jobs: int) -> list[Row]:
+def rows_of(work: Path, kind: str, jobs: int) -> list[Record]:
     """Rows of a set, or of refinements and detections in the set "shapes"; finished meshes are read
     from the file."""
     folder = work / photographs_of(kind)
@@ -252,7 +249,7 @@ def rows_of(work: Path, kind: str, jobs: int) -> list[Row]:
     return measured(work / f"{kind}.jsonl", measure, tasks, jobs, kind)
 
 
-def request_of(kind: str, pose: str, samples: Sequence[Row]) -> str:
+def request_of(kind: str, pose: str, samples: Sequence[Record]) -> str:
     """Digest of all that the rows of a mesh depend on: its photographs, that beside them, and the
     code."""
     chosen = set_of(kind)

@@ -41,6 +41,7 @@ from curvireg_torch.registration.confidence import RELIABLE
 from scripts._shared import (
     RESULTS,
     RIGHT_DEG,
+    Record,
     measured,
     read_json,
     run,
@@ -48,7 +49,7 @@ from scripts._shared import (
     write_json,
 )
 from scripts.benchmark.make import TWIN, Variants
-from scripts.calibration.measure import Row, errors_of, mesh_of, symmetries_of, true_centre
+from scripts.calibration.measure import errors_of, mesh_of, symmetries_of, true_centre
 from scripts.calibration.sets import SETS
 
 SOURCES = {name: each.misleads for name, each in SETS.items() if each.misleads}
@@ -71,7 +72,7 @@ Case: TypeAlias = tuple[str, Tensor, Tensor, Tensor | None]
 """A way of misleading: its name, photograph, box and camera."""
 
 
-def cases_of(kind: str, sample: Row) -> list[Case]:
+def cases_of(kind: str, sample: Record) -> list[Case]:
     """The ways in which a kind misleads with a photograph."""
     image = sample["image"]
     box = sample["box"].double()
@@ -147,10 +148,10 @@ def cropped(image: Tensor, box: Tensor) -> Case:
 def answer_of(
     result: cr.Registration,
     registrar: cr.Registrar,
-    sample: Row,
+    sample: Record,
     K: Tensor | None,
     right_mesh: int,
-) -> Row:
+) -> Record:
     """What a result says, and how wrong it is."""
     R = torch.stack([h.rotation.double() for h in result.hypotheses])
     degrees = float(errors_of(R, sample, symmetries_of(sample, registrar))[0])
@@ -183,7 +184,7 @@ def axis_is_right(result: cr.Registration, registrar: cr.Registrar, turn: Tensor
     return bool(degrees <= result.axis.tolerance_deg)
 
 
-def measure(task: tuple[Path, list[str], list[int]]) -> list[Row]:
+def measure(task: tuple[Path, list[str], list[int]]) -> list[Record]:
     """Rows of the photographs of one mesh."""
     folder, kinds, indices = task
     torch.set_num_threads(1)
@@ -210,7 +211,7 @@ def registrars_of(
     kind: str,
     alone: cr.Registrar,
     folder: Path,
-    sample: Row,
+    sample: Record,
 ) -> list[tuple[cr.Registrar, int]]:
     """The registrar of the mesh ``alone``, or two of the mesh and another one, in both orders; and
     which mesh the photograph shows."""
@@ -259,7 +260,7 @@ def tasks_of(work: Path, name: str, each: int) -> Iterator[tuple[Path, list[str]
             yield folder, kinds, indices
 
 
-def table_of(rows: Sequence[Row]) -> Row:
+def table_of(rows: Sequence[Record]) -> Record:
     """Counts of some rows."""
     sure = [row for row in rows if row["reliable"]]
     axes = [row for row in rows if row.get("verdict") == "reliable axis"]

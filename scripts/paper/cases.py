@@ -18,6 +18,7 @@ from curvireg_torch.geometry import crop_images, rotation_towards
 from curvireg_torch.geometry.viewpoint import DEFAULT_DISTANCE
 from curvireg_torch.mesh import Mesh, mesh_centre, mesh_radius
 from curvireg_torch.pipeline import BankSettings
+from scripts._shared import Record
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def find_cases(kind: str, root: Path) -> list[Case]:
     return sorted(cases, key=lambda case: case.mesh_path)
 
 
-def _case(kind: Any, s: dict[str, Any]) -> Case | None:
+def _case(kind: Any, s: Record) -> Case | None:
     translation = s.get("translation", torch.full((3,), math.nan))
     pose = torch.cat([s["rotation"], translation[:, None]], dim=1).double()
     known = bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all())

@@ -31,7 +31,7 @@ from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.matching.search import BEST_VIEWS, coherent_of, different_views, refine, search
 from curvireg_torch.mesh import Mesh, load_mesh
 from curvireg_torch.pipeline import FIELDS, PRESETS, BankSettings, Pipeline, ViewPolicy
-from scripts._shared import RIGHT_DEG
+from scripts._shared import RIGHT_DEG, Record
 from scripts.paper.cases import Case
 from scripts.paper.detectors import DETECTORS
 from scripts.paper.measures import share_near
@@ -44,8 +44,6 @@ from scripts.paper.tables import (
     REPEATED_DEPTHS,
     SEARCHED_PAIRS,
 )
-
-Record = dict[str, Any]
 
 CURVE_DETECTORS = ("MFC", "MCS", "IG", "SIFT", "SOBEL")
 SENSITIVE = ("MFC", "MCS", "IG", "SOBEL", "CANNY")

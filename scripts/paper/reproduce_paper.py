@@ -31,7 +31,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
@@ -42,6 +42,7 @@ from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.utils.files import write_file
 from scripts._shared import (
+    Record,
     commit,
     measured,
     read_lines,
@@ -86,7 +87,7 @@ def measure(
     settings: BankSettings,
     pose: str,
     cases: list[Case],
-) -> list[dict[str, Any]]:
+) -> list[Record]:
     """Records of the cases of one mesh."""
     from scripts.paper.measure import MEASURES
 

@@ -4,17 +4,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import getitem
-from typing import Any
 
 import numpy as np
 
 from curvireg_torch.filters.focus import PAPER_THRESHOLD
-from scripts._shared import RIGHT_DEG, markdown_table
+from scripts._shared import RIGHT_DEG, Record, markdown_table
 from scripts.paper import printed
 from scripts.paper.measures import Estimate, bootstrap
 
 Cell = str | Estimate
-Value = Callable[[dict[str, Any]], float]
+Value = Callable[[Record], float]
 
 PHOTOS = ("MFC", "MCS", "IG")
 REPEATED_DEPTHS = ("CS", "ASG", "HFN")
@@ -60,7 +59,7 @@ class Table:
 class Records:
     """The records of photographs, with category and CAD, and ``what`` they are measured on."""
 
-    records: Sequence[dict[str, Any]]
+    records: Sequence[Record]
     what: str
 
     def mean(self, value: Value) -> Estimate:

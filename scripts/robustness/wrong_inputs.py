@@ -22,7 +22,6 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from itertools import cycle
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -30,7 +29,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from scripts._shared import RESULTS, read_json, run, stamp, write_json
+from scripts._shared import RESULTS, Record, read_json, run, stamp, write_json
 
 # processor seconds and memory that a command may take
 SECONDS = 20.0
@@ -135,7 +134,7 @@ def limited() -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (MEGABYTES << 20, MEGABYTES << 20))
 
 
-def answer(line: str, folder: Path, expected: str | None) -> dict[str, Any]:
+def answer(line: str, folder: Path, expected: str | None) -> Record:
     """Run a command line; what is wrong with its answer is under ``failure``.
 
     ``expected`` must occur in the message; None accepts a result as well.
