@@ -24,6 +24,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from curvireg_torch.utils.arrays import Array
 from scripts._shared import in_processes, read_json, run, write_json
 from scripts.scenes.textured import TexturedMesh
 
@@ -141,7 +142,7 @@ def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
     return None
 
 
-def candidate_rotations() -> np.ndarray:
+def candidate_rotations() -> Array:
     """(32, 3, 3) possible symmetries: the 24 rotations of a cube, identity first, and steps of 30
     degrees about z."""
     cube = sorted(Rotation.create_group("O").as_matrix().round(), key=lambda R: -np.trace(R))
@@ -150,7 +151,7 @@ def candidate_rotations() -> np.ndarray:
     return np.concatenate([cube, about_z.as_matrix()])
 
 
-def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
+def sample_points(model: TexturedMesh) -> tuple[Array, Array]:
     """20,000 points of the surface relative to the centre of its box, in radii, and their colours
     in [0, 1]."""
     mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(model.triangles), process=False)
@@ -164,13 +165,13 @@ def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
     return (points - model.centre) / model.radius, colours
 
 
-def lie_on(points: np.ndarray, tree: cKDTree) -> bool:
+def lie_on(points: Array, tree: cKDTree) -> bool:
     """Whether 90 % of points (N, 3) lie within 4 % of the radius of those of the tree."""
     distances, _ = tree.query(points, distance_upper_bound=0.04)
     return bool(np.isfinite(distances).mean() >= 0.9)
 
 
-def symmetries(points: np.ndarray, colours: np.ndarray) -> tuple[list[int], list[int]]:
+def symmetries(points: Array, colours: Array) -> tuple[list[int], list[int]]:
     """Candidate rotations that map the shape to itself, and those that preserve its colours too.
 
     90 % of the points have the colour of the others, blurred over 48 neighbours.
@@ -178,14 +179,14 @@ def symmetries(points: np.ndarray, colours: np.ndarray) -> tuple[list[int], list
     tree = cKDTree(points)
     some = slice(None, None, 16)
 
-    def fits(R: np.ndarray, part: slice) -> bool:
+    def fits(R: Array, part: slice) -> bool:
         return lie_on(points[part] @ R.T, tree)
 
-    def blurred(R: np.ndarray) -> np.ndarray:
+    def blurred(R: Array) -> Array:
         _, near = tree.query(points[some] @ R.T, k=48)
         return colours[near].mean(axis=1)
 
-    def has_other_colours(R: np.ndarray) -> bool:
+    def has_other_colours(R: Array) -> bool:
         gaps = np.abs(blurred(R) - own).max(axis=1)
         return bool((gaps > 0.12).mean() >= 0.1)
 
@@ -196,7 +197,7 @@ def symmetries(points: np.ndarray, colours: np.ndarray) -> tuple[list[int], list
     return shape, [k for k in shape if not has_other_colours(rotations[k])]
 
 
-def copy_of(cloud: np.ndarray, others: dict[str, tuple[np.ndarray, cKDTree]]) -> str | None:
+def copy_of(cloud: Array, others: dict[str, tuple[Array, cKDTree]]) -> str | None:
     """Name of the first of the others with the same shape."""
     span = np.ptp(cloud, axis=0)
     for name, (extents, tree) in others.items():
@@ -210,7 +211,7 @@ def is_used(name: str) -> bool:
     return hashlib.sha256(name.encode()).digest()[0] % 2 == 0
 
 
-def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, np.ndarray | None]:
+def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, Array | None]:
     """Convert one object; returns its row, why it is left out (or None), and points of its
     surface."""
     row, unpacked, out = task

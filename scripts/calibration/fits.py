@@ -16,6 +16,7 @@ from curvireg_torch.registration.confidence import (
     LogisticModel,
 )
 from curvireg_torch.registration.mirror_image import MIRROR_DOUBT
+from curvireg_torch.utils.arrays import Array
 from scripts._shared import RIGHT_DEG, Record
 from scripts.calibration.sets import SETS
 
@@ -24,7 +25,7 @@ RESOLUTIONS = np.arange(0.5, 1.55, 0.1).round(2).tolist()
 """Those that are tried. Scores of two poses that look the same differ by up to 0.5."""
 
 
-def folds_of(rows: Sequence[Record]) -> np.ndarray:
+def folds_of(rows: Sequence[Record]) -> Array:
     """(n,) fold of each row; groups are assigned so that folds have about equal sizes."""
     groups, member, counts = np.unique(
         [row["group"] for row in rows], return_inverse=True, return_counts=True
@@ -37,7 +38,7 @@ def folds_of(rows: Sequence[Record]) -> np.ndarray:
     return fold[member]
 
 
-def fit_logistic(rows: Sequence[Record], weight: np.ndarray, signs: Mapping[str, float]) -> Record:
+def fit_logistic(rows: Sequence[Record], weight: Array, signs: Mapping[str, float]) -> Record:
     """Weights and bias of the probability that a row is ``right``.
 
     The standardised weights have a unit Gaussian prior, and the sign in ``signs``, if there is one.
@@ -50,7 +51,7 @@ def fit_logistic(rows: Sequence[Record], weight: np.ndarray, signs: Mapping[str,
     spread[spread < 1e-6] = np.inf  # a constant feature gets weight 0
     Z = (X - mean) / spread
 
-    def loss(p: np.ndarray) -> tuple[float, np.ndarray]:
+    def loss(p: Array) -> tuple[float, Array]:
         w = p[:-1]
         logit = Z @ w + p[-1]
         losses = np.logaddexp(0.0, logit) - y * logit
@@ -69,7 +70,7 @@ def fit_logistic(rows: Sequence[Record], weight: np.ndarray, signs: Mapping[str,
     return {"weights": weights, "bias": round(bias, 4), "n": len(y)}
 
 
-def fit_level(rows: Sequence[Record], weight: np.ndarray, constants: Record) -> Record:
+def fit_level(rows: Sequence[Record], weight: Array, constants: Record) -> Record:
     """The model of ``constants`` with a scale and a level of its logit, so that the confidence of
     the first hypothesis, its share included, is right: two numbers, which few photographs
     determine. Slope and resolution of the shares stay."""
@@ -77,7 +78,7 @@ def fit_level(rows: Sequence[Record], weight: np.ndarray, constants: Record) -> 
     share = np.array([first_share(row, constants) for row in rows])
     first = np.array([row["first"] for row in rows])
 
-    def loss(p: np.ndarray) -> float:
+    def loss(p: Array) -> float:
         scale, level = p
         confidence = np.clip(expit(scale * logit + level) * share, 1e-9, 1.0 - 1e-9)
         said = np.where(first, confidence, 1.0 - confidence)
@@ -96,12 +97,12 @@ def row_logit(row: Record, constants: Record) -> float:
     return constants["bias"] + sum(terms)
 
 
-def fit_shares(rows: Sequence[Record], weight: np.ndarray, *, ties: bool) -> Record:
+def fit_shares(rows: Sequence[Record], weight: Array, *, ties: bool) -> Record:
     """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some
     pose is right and some are not; without ``ties`` the resolution is 0."""
     decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT_DEG]
 
-    def filled(name: str, value: float) -> np.ndarray:
+    def filled(name: str, value: float) -> Array:
         columns = zip_longest(*(rows[k][name] for k in decided), fillvalue=value)
         return np.array(list(columns)).T
 
@@ -137,11 +138,11 @@ def first_share(row: Record, constants: Record) -> float:
     return np.exp(logits[0] - logsumexp(logits))
 
 
-def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Record:
+def quality_of(p: Array, right: Array, weight: Array) -> Record:
     """How well probabilities (n,) tell the right answers (n,) bool."""
     sure = p >= RELIABLE
 
-    def mean(values: np.ndarray, chosen: Any = slice(None)) -> float:
+    def mean(values: Array, chosen: Any = slice(None)) -> float:
         return np.average(values[chosen], weights=weight[chosen])
 
     both = len(np.unique(right)) == 2
@@ -156,13 +157,13 @@ def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Record:
     }
 
 
-def errors_within(errors: np.ndarray) -> Record:
+def errors_within(errors: Array) -> Record:
     """Fractions of errors (n,) in degrees within 5 and 15, and their median."""
     within = {f"within {limit}": (errors < limit).mean() for limit in (5, 15)}
     return within | {"median": np.median(errors)}
 
 
-def weights_of(sets: np.ndarray) -> np.ndarray:
+def weights_of(sets: Array) -> Array:
     """(n,) weights of rows by their sets, with which these have their assumed shares of all
     photographs."""
     weight = np.ones(len(sets))
@@ -185,7 +186,7 @@ def fit_registrations(rows: list[Record], *, exact: bool) -> tuple[Record, Recor
     weight = weights_of(sets)
     signs = dict.fromkeys(EVIDENCE_FEATURES, 1.0) | dict.fromkeys(DOUBT_FEATURES, -1.0)
 
-    def fit(train: np.ndarray) -> Record:
+    def fit(train: Array) -> Record:
         # what fits, but is less probable than the mirror image, tells nothing of what fits
         train = train & ~is_mirrored
         some = [rows[k] for k in np.flatnonzero(train)]

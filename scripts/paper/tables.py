@@ -4,16 +4,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import getitem
+from pathlib import Path
 
 import numpy as np
 
 from curvireg_torch.filters.focus import PAPER_THRESHOLD
-from scripts._shared import RIGHT_DEG, Record, markdown_table
+from scripts._shared import RIGHT_DEG, Record, markdown_table, read_json
 from scripts.paper import printed
 from scripts.paper.measures import Estimate, bootstrap
 
 Cell = str | Estimate
 Value = Callable[[Record], float]
+
+SHOWN = read_json(Path(__file__).with_suffix(".json"))
+"""Title, definition and columns of each table."""
 
 PHOTOS = ("MFC", "MCS", "IG")
 REPEATED_DEPTHS = ("CS", "ASG", "HFN")
@@ -28,8 +32,6 @@ CLASS_DETECTORS = ("MFC", "MCS", "PCI", "SOBEL", "CANNY")
 # degrees about the object's z axis: 40 views, the true one among them
 CURVE_OFFSETS = tuple(range(-100, 100, 5))
 SHOWN_OFFSETS = (-90, -20, -10, -5, 0, 5, 10, 20, 90)
-PARTS = ("elevation", "azimuth", "in-plane", "distance")
-POSE_COLUMNS = tuple(f"{name} {kind}" for name in PARTS for kind in ("Est.", "Clo."))
 
 
 @dataclass(frozen=True)
@@ -74,26 +76,21 @@ class Records:
         """Those of one category."""
         return Records([r for r in self.records if r["category"] == category], self.what)
 
-    def table(
-        self,
-        name: str,
-        title: str,
-        definition: str,
-        columns: Sequence[str],
-        rows: Sequence[Sequence[Cell | Value]],
-    ) -> Table:
+    def table(self, name: str, rows: Sequence[Sequence[Cell | Value]]) -> Table:
         """A table with the means of values, which also says on how many they were measured; short
         rows end in dashes."""
+        shown = SHOWN[name]
+        columns = shown["columns"]
         cads = len({r["cad"] for r in self.records})
         text = (
-            f"{definition} {self.what}, N = {len(self.records)} ({cads} CADs); in brackets 95 % "
-            "by bootstrap of the CADs."
+            f"{shown['definition']} {self.what}, N = {len(self.records)} ({cads} CADs); in "
+            "brackets 95 % by bootstrap of the CADs."
         )
         cells = []
         for row in rows:
             means = [self.mean(cell) if callable(cell) else cell for cell in row]
             cells.append([*means, *["-"] * (len(columns) - len(row))])
-        return Table(name, title, text, columns, cells)
+        return Table(name, shown["title"], text, columns, cells)
 
 
 def beside_the_paper(
@@ -150,18 +147,9 @@ def detector_tables(records: Records) -> list[Table]:
         ]
         rows.append(row)
     rows.append(["any pixel (chance)", at("ip", "chance")])
-    text = (
-        "IP: fraction of the photograph's points within 2 px of a point of the curvilinear "
-        "saliency (CS) of the view at the true pose. HD: Hausdorff distance of the two sets, px of "
-        "the crop (paper: of unknown pictures). At most 4 % of the pixels are points. MFC x CS is "
-        "the preset `classical`'s, not the paper's. The web collection of the paper was never "
-        "published."
-    )
-    of_paper = ("paper, PASCAL3D+", "paper, web")
-    columns = ["detector", "IP", *of_paper, "HD", "paper, PASCAL3D+ ", "paper, web ", "points"]
     of_class = {name: [at("ip", name)] for name in CLASS_DETECTORS}
     return [
-        records.table("detectors", "Detectors: IP and Hausdorff distance", text, columns, rows),
+        records.table("detectors", rows),
         beside_the_paper("ip", "IP by class", records, of_class, printed.IP_BY_CLASS, ("ours",)),
     ]
 
@@ -172,12 +160,7 @@ def repeatability_tables(records: Records) -> list[Table]:
         [depth, *(at("repeatability", f"{depth}/{photo}") for photo in PHOTOS)]
         for depth in REPEATED_DEPTHS
     ]
-    title = "Repeatability, depth field / field of the photograph"
-    text = (
-        "Fraction of the points of the view at the true pose with a point of the photograph "
-        "within 2 px (the paper plots it for two objects)."
-    )
-    return [records.table("repeatability", title, text, ["", *PHOTOS], rows)]
+    return [records.table("repeatability", rows)]
 
 
 def curve_tables(records: Records) -> list[Table]:
@@ -187,12 +170,7 @@ def curve_tables(records: Records) -> list[Table]:
         [f"{offset}", *(at("curve", name, CURVE_OFFSETS.index(offset)) for name in names)]
         for offset in SHOWN_OFFSETS
     ]
-    title = "Repeatability around the true view"
-    text = (
-        "Fraction of the points of the view with a point of the photograph within 2 px, with the "
-        "object turned about its z axis by so many degrees from the true pose."
-    )
-    return [records.table("curve", title, text, ["degrees", *names], rows)]
+    return [records.table("curve", rows)]
 
 
 def sensitivity_tables(records: Records) -> list[Table]:
@@ -206,12 +184,7 @@ def sensitivity_tables(records: Records) -> list[Table]:
         rows.append([f"{100 * share:g} %", f"{eps:g} px", *cells])
     for threshold in records.records[0]["threshold"]:
         rows.append(["4 %", f"2 px, threshold {threshold}", at("threshold", threshold)])
-    text = (
-        "IP with other shares of the pixels that are points, in photograph and view, radii, and "
-        "thresholds of MFC (the paper: .0067)."
-    )
-    columns = ["points", "eps", *names]
-    return [records.table("sensitivity", "Sensitivity of IP", text, columns, rows)]
+    return [records.table("sensitivity", rows)]
 
 
 def _right(variant: str, pair: str, rank: int) -> Value:
@@ -240,13 +213,8 @@ def precision_tables(records: Records) -> list[Table]:
 
     rows = [[pair, *values(pair), _printed(printed.PRECISION[pair])] for pair in PAIRS]
     rows += limit_rows()
-    text = (
-        f"Fraction of the photographs whose best view is within {RIGHT_DEG:g}° of the true one "
-        "(the paper does not define its precision), before the search."
-    )
-    columns = ["depth / photograph", *NAMES.values(), "paper"]
     return [
-        records.table("precision", "Precision, nine pairs", text, columns, rows),
+        records.table("precision", rows),
         beside_the_paper(
             "precision",
             "Precision by class",
@@ -268,12 +236,7 @@ def rank_tables(records: Records) -> list[Table]:
             rows.append([f"{name}, views by lot", *(_by_lot(variant, k) for k in RANKS)])
             ceiling = [at(variant, "ceiling")] * len(RANKS)
             rows.append([f"{name}, a right view is there", *ceiling])
-    text = (
-        f"Fraction of the photographs with a view within {RIGHT_DEG:g}° among the best k (the "
-        "paper plots it)."
-    )
-    columns = ["depth / photograph", *(f"k = {k}" for k in RANKS)]
-    return [records.table("ranks", "Precision at rank k", text, columns, rows)]
+    return [records.table("ranks", rows)]
 
 
 def angle_tables(records: Records) -> list[Table]:
@@ -284,7 +247,7 @@ def angle_tables(records: Records) -> list[Table]:
     def add(name: str, *closest: str, estimated: Sequence[str] = ()) -> None:
         """A row with the errors of the estimate, if there is one, and of the closest view."""
         row = [name]
-        for k in range(len(PARTS)):
+        for k in range(4):  # elevation, azimuth, in-plane angle, distance
             row.append(at(*estimated, k) if estimated else "-")
             row.append(at(*closest, k))
         rows.append(row)
@@ -297,15 +260,7 @@ def angle_tables(records: Records) -> list[Table]:
                 add(f"{name}, {pair}, of refined views", variant, pair, "refined")
                 rows.append([f"{pair}, paper", *printed.POSE_ERRORS[pair]])
         add(f"{name}, bank", variant, "limit")
-    text = (
-        "Mean absolute errors, angles in degrees, distance in percent (that at which the mesh "
-        "fills the box, with the camera of the annotation; the paper's centimetres are of unknown "
-        "objects). Est.: after the search. Clo.: the closest of the three retrieved views; of "
-        "refined views: each the best of a grid of 5°, as an azimuth of 1.2° on a grid of 20° must "
-        "be. Bank: the closest of all its views. Angles of symmetric objects count in full."
-    )
-    columns = ["depth / photograph", *POSE_COLUMNS]
-    return [records.table("angles", "Errors of the pose", text, columns, rows)]
+    return [records.table("angles", rows)]
 
 
 def search_tables(records: Records) -> list[Table]:
@@ -325,13 +280,7 @@ def search_tables(records: Records) -> list[Table]:
         for variant, name in NAMES.items()
         for pair in SEARCHED_PAIRS
     ]
-    text = (
-        "More than one: photographs in which one of the best three views is coherent with the "
-        f"best, so that something lies between them. Precision within {RIGHT_DEG:g}° of the best "
-        "view, after the search, and after it with views down the ranking until two are coherent."
-    )
-    columns = ["depth / photograph", "more than one", "before", "after", "down the ranking"]
-    return [records.table("search", "What the search does", text, columns, rows)]
+    return [records.table("search", rows)]
 
 
 def focus_tables(records: Records) -> list[Table]:
@@ -346,24 +295,13 @@ def focus_tables(records: Records) -> list[Table]:
         for threshold in sorted({name.split()[-1] for name in names})
     ]
     rows += [[name, *cells(name)] for name in ("MCS", "IG")]
-    text = (
-        "Least CS of an edge, relative to the largest (the paper: e⁻⁵ = .0067, as for MCS): IP, "
-        "and precision of the corrected ranking, of focus curves alone and weighted by CS."
-    )
-    columns = ["threshold", "MFC, IP", "precision", "MFC x CS, IP", "precision "]
-    thresholds = records.table("thresholds", "Threshold of focus curves", text, columns, rows)
+    thresholds = records.table("thresholds", rows)
     shown = (f"MFC {PAPER_THRESHOLD:.4f}", f"MFC x CS {PAPER_THRESHOLD:.4f}", "MCS", "IG")
     rows = [
         [name, *(right_at(field, key) for field in shown), at("chance", key)]
         for name, key in PROTOCOLS.items()
     ]
-    text = (
-        "The same rankings (corrected, CS of depth) by other protocols than the rotation of the "
-        f"best view within {RIGHT_DEG:g}°."
-    )
-    columns = ["protocol", "MFC", "MFC x CS", "MCS", "IG", "chance"]
-    title = "Protocols of precision"
-    return [thresholds, records.table("protocols", title, text, columns, rows)]
+    return [thresholds, records.table("protocols", rows)]
 
 
 PROTOCOLS = {
@@ -380,5 +318,4 @@ def grid_tables(records: Records) -> list[Table]:
         [f"{n} x {n}", *(right_at(variant, f"grid {n}") for variant in VARIANTS)] for n in GRIDS
     ]
     rows += limit_rows()
-    text = "Precision of CS/MFC by the cells of the descriptor; the paper says that 8 x 8 is best."
-    return [records.table("grids", "Grids", text, ["cells", *NAMES.values()], rows)]
+    return [records.table("grids", rows)]

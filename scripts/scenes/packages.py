@@ -5,7 +5,7 @@ import numpy as np
 import trimesh
 
 from scripts.scenes.materials import random_colour, random_picture
-from scripts.scenes.surfaces import Rng, raised
+from scripts.scenes.surfaces import Array, Rng, raised
 from scripts.scenes.textured import Texture, TexturedMesh
 
 # size of a label in px
@@ -17,7 +17,7 @@ FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRI
 LETTERS = "ABCDEFGHIKLMNOPRSTUVZ"
 
 
-def label(rng: Rng) -> np.ndarray:
+def label(rng: Rng) -> Array:
     """(HEIGHT, WIDTH, 3) uint8: bands, a picture, words and small print on one colour."""
     picture = np.full((HEIGHT, WIDTH, 3), 255 * random_colour(rng), np.float32)
     for _ in range(rng.integers(0, 4)):
@@ -42,7 +42,7 @@ def label(rng: Rng) -> np.ndarray:
     return picture
 
 
-def solid_of_revolution(rng: Rng) -> tuple[np.ndarray, ...]:
+def solid_of_revolution(rng: Rng) -> tuple[Array, ...]:
     """Vertices, faces and texture coordinates of a can, or of a bottle with shoulder and neck, of
     height 1."""
     radius = rng.uniform(0.18, 0.5)
@@ -65,7 +65,7 @@ def solid_of_revolution(rng: Rng) -> tuple[np.ndarray, ...]:
     return points.reshape(-1, 3), faces.swapaxes(1, 2).reshape(-1, 3), uv.reshape(-1, 2)
 
 
-def carton(rng: Rng) -> tuple[np.ndarray, ...]:
+def carton(rng: Rng) -> tuple[Array, ...]:
     """Vertices, faces and texture coordinates of a box of height 1, with another part of the label
     on each side."""
     width = rng.uniform(0.3, 0.9)

@@ -1,12 +1,13 @@
 """Elementary surfaces that shapes are built from."""
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-Array: TypeAlias = np.ndarray[Any, Any]
+from curvireg_torch.utils.arrays import Array
+
 Rng: TypeAlias = np.random.Generator
 
 AROUND = 36  # vertices around a round surface; enough for pictures of 128 px

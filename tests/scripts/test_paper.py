@@ -18,7 +18,7 @@ import torch
 from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from scripts._shared import commit, read_json, read_lines
+from scripts._shared import RIGHT_DEG, commit, read_json, read_lines
 from scripts._shared import run as run_script
 from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
@@ -79,6 +79,17 @@ def test_points_of_the_true_view_are_repeated_most(root):
         assert of_eps == sorted(of_eps)
         assert 10 < record["points"]["MCS"] <= 0.04 * 64 * 64 + 1
         assert 0 < record["hausdorff"]["MCS"] < 90
+
+
+def test_columns_are_of_what_is_measured():
+    columns = {name: shown["columns"][1:] for name, shown in tables.SHOWN.items()}
+    assert columns["curve"] == list(measure.CURVE_DETECTORS)
+    assert columns["sensitivity"] == ["eps", *measure.SENSITIVE]
+    assert columns["repeatability"] == list(tables.PHOTOS)
+    assert columns["ranks"] == [f"k = {rank}" for rank in tables.RANKS]
+    assert columns["precision"][:3] == columns["grids"] == list(tables.NAMES.values())
+    texts = " ".join(shown["definition"] for shown in tables.SHOWN.values())
+    assert texts.count(f"{RIGHT_DEG:g}°") == 4
 
 
 def test_tables_rank_by_the_terms_of_the_paper_alone():
