@@ -133,7 +133,7 @@ def measured(
     out.parent.mkdir(parents=True, exist_ok=True)
     known = {}
     if out.exists():
-        known = {str(entry["task"]): entry["rows"] for entry in read_lines(out)}
+        known = {entry["task"]: entry["rows"] for entry in read_lines(out)}
     new = {key: task for key, task in tasks.items() if key not in known}
     with out.open("a", encoding="utf-8") as file:
         for (key, _), rows in in_processes(partial(_of_item, function), new.items(), jobs, name):
