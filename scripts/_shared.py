@@ -14,8 +14,6 @@ from typing import Any, Literal, TypeAlias, get_args, get_origin
 from tqdm import tqdm
 
 from curvireg_torch.errors import CurviregError, WorkerError
-from curvireg_torch.formats.meshes.files import mesh_digest
-from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.utils.executors import Workers
 from curvireg_torch.utils.files import file_digest, text_digest, write_file
 
@@ -150,6 +148,9 @@ def request_digest(
     pictures: Iterable[str | Path],
 ) -> str:
     """Digest of all that the rows of a mesh and photographs depend on, code included."""
+    from curvireg_torch.formats.meshes.files import mesh_digest  # imports torch
+    from curvireg_torch.jobs.runner import results_digest
+
     code = [results_digest(), *map(file_digest, scripts)]
     photographs = [file_digest(Path(picture)) for picture in pictures]
     return text_digest(json.dumps([request, code, mesh_digest(Path(mesh)), photographs]))

@@ -11,9 +11,9 @@ from numpy.testing import assert_allclose
 pytest.importorskip("sklearn")
 
 from curvireg_torch.geometry.framing import outside_fraction
+from curvireg_torch.jobs import runner
 from curvireg_torch.registration.mirror_image import MIRROR_DOUBT
 from curvireg_torch.synthetic import example_mesh
-from scripts import _shared
 from scripts.benchmark.make import TWIN, Packages, Shapes, Tied
 from scripts.calibration import fits, measure, sets
 from scripts.calibration.calibrate import covariance_quality
@@ -101,7 +101,7 @@ def test_rows_are_kept_of_the_same_photographs_and_code_alone(tmp_path, monkeypa
     assert measured() == (more, [upright, *more])
     write_image(scenes / "000002" / "gray" / "000007.png")
     assert measured()[0] == [upright, [1, 5]], "the photograph beside those of an object counts"
-    monkeypatch.setattr(_shared, "results_digest", lambda: "of other code")
+    monkeypatch.setattr(runner, "results_digest", lambda: "of other code")
     assert measured()[0] == [upright, *more]
 
 
