@@ -67,7 +67,7 @@ class Evidence(Rows):
         details: by how much the contours that only this pose or only the best one predicts speak
             for it, see ``compare_details``; 0 for poses that score far less than the best.
         contours: by how much the edges under its contours exceed chance, see
-            ``contour_evidence``; 0 without the contour fit.
+            ``edge_excess``; 0 without the contour fit.
 
     Example:
         >>> from dataclasses import replace

@@ -113,7 +113,7 @@ def fit_contours(
     T0 = starts.detach().cpu().double()
     if len(T0) == 0:
         none = T0.new_zeros(0)
-        return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long())
+        return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long(), none)
     if object_mask is not None:
         check_tensor(object_mask, "object_mask", (len(images), 1, None, None))
     crops = EdgeCrops.cut(images, boxes, margin, object_mask)

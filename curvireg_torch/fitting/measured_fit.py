@@ -39,13 +39,15 @@ class ContourFit(Rows):
         start_support: (N,) edge support of the starts (at half size for starts that are not
             finished).
         observable: (N,) int64, number of the six directions that the contours determine.
+        edge_excess: (N,) float64, see :func:`edge_excess`.
 
     Example:
         >>> T = torch.eye(4).repeat(2, 1, 1)
         >>> covariance = torch.zeros(2, 6, 6)
         >>> support = torch.tensor([0.6, 0.3])
+        >>> before = torch.tensor([0.2, 0.2])
         >>> observable = torch.tensor([6, 6])
-        >>> fit = ContourFit(T, covariance, support, torch.tensor([0.2, 0.2]), observable)
+        >>> fit = ContourFit(T, covariance, support, before, observable, edge_excess=support)
         >>> fit.trustworthy.tolist()
         [True, False]
     """
@@ -55,6 +57,7 @@ class ContourFit(Rows):
     edge_support: Tensor
     start_support: Tensor
     observable: Tensor
+    edge_excess: Tensor
 
     @property
     def trustworthy(self) -> Tensor:
@@ -74,7 +77,12 @@ def measured_fit(
         edges, state.points, state.T, full.K, contours.centre, radius=contours.radius
     )
     return ContourFit(
-        state.T, covariance, edge_support=support, start_support=before, observable=observable
+        state.T,
+        covariance,
+        edge_support=support,
+        start_support=before,
+        observable=observable,
+        edge_excess=edge_excess(full, state),
     )
 
 
@@ -91,19 +99,17 @@ def measure_contours(
 
 
 @torch.no_grad()
-def contour_support(
+def edges_at(
     contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
-) -> Tensor:
-    """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of
-    fitted ones."""
+) -> tuple[Tensor, Tensor]:
+    """Edge support (N,) and :func:`edge_excess` (N,) of poses ``T`` (N, 4, 4) that are not fitted,
+    as :class:`ContourFit` has them of fitted ones."""
     problem = ContourProblem.of(contours, crops, K, image_index)
-    return problem.edge_support(problem.state(T))
+    state = problem.state(T)
+    return problem.edge_support(state), edge_excess(problem, state)
 
 
-@torch.no_grad()
-def contour_evidence(
-    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
-) -> Tensor:
+def edge_excess(problem: ContourProblem, state: ContourState) -> Tensor:
     """How far the edges under the contours of poses exceed what chance puts there.
 
     The mean strength of the edges at the outline, minus that at the same points shifted, plus the
@@ -112,27 +118,23 @@ def contour_evidence(
     that a pose predicts, as long as they are there.
 
     Args:
-        contours: of the mesh.
-        crops: of photographs.
-        K: (N, 3, 3) cameras of the poses.
-        T: (N, 4, 4) poses.
-        image_index: (N,) the crop of each pose.
+        problem: of N poses at full size.
+        state: of the poses, with their contour points.
 
     Returns:
         (N,) float64, about -0.3 to 1.5; near 0 for a pose that is far off.
     """
-    problem = ContourProblem.of(contours, crops, K, image_index)
-    points = problem.state(T).points
-    uv = pixels(points.model, T, problem.K)
+    points = state.points
+    uv = pixels(points.model, state.T, problem.K)
     angle = torch.arange(CHANCE_DIRECTIONS) * (2.0 * math.pi / CHANCE_DIRECTIONS)
     shifts = CHANCE_SHIFT * torch.stack([angle.cos(), angle.sin()], dim=1).to(uv)
     places = torch.cat([uv[None], uv + shifts[:, None, None]])  # as predicted, and shifted
     copies = len(places)
-    every = torch.arange(len(T), device=T.device).repeat(copies)
+    every = torch.arange(len(uv), device=uv.device).repeat(copies)
     normals = points.normals.repeat(copies, 1, 1)
     strength = problem[every].strength_near(places.flatten(0, 1), normals)
-    strength = strength.unflatten(0, (copies, len(T)))
-    counted = points.valid & (problem.edges.counts(uv, points.valid, image_index) > 0)
+    strength = strength.unflatten(0, (copies, len(uv)))
+    counted = points.valid & (problem.edges.counts(uv, points.valid, problem.image_index) > 0)
     excess = strength[0] - strength[1:].mean(dim=0)
     on_outline = counted & points.outline
     within = counted & ~points.outline
@@ -140,5 +142,5 @@ def contour_evidence(
     most_points = torch.maximum(outline_points, within.sum(dim=1))
     of_outline = (excess * on_outline).sum(dim=1) / outline_points.clamp(min=1)
     of_inner = (excess * within).sum(dim=1) / most_points.clamp(min=1)
-    evidence: Tensor = of_outline + of_inner
-    return evidence
+    excess_of_both: Tensor = of_outline + of_inner
+    return excess_of_both

@@ -23,7 +23,7 @@ from .least_squares import (
     fit_points,
     pose_covariance,
 )
-from .measured_fit import FULL_SIZE_RADII, ContourFit
+from .measured_fit import FULL_SIZE_RADII, ContourFit, edge_excess
 
 # Corners of a view: how many at most, how many px apart at least, and the least strength as a
 # fraction of the strongest one's
@@ -123,7 +123,12 @@ def fit_texture(
         both, joined, state.T, problem.K, problem.centre, radius=problem.contours.radius
     )
     return ContourFit(
-        fine.T, covariance, edge_support=after, start_support=support, observable=observable
+        fine.T,
+        covariance,
+        edge_support=after,
+        start_support=support,
+        observable=observable,
+        edge_excess=edge_excess(problem, state),
     )
 
 

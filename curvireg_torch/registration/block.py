@@ -14,7 +14,7 @@ from ..evidence import Evidence
 from ..fitting.details import compared, contour_details
 from ..fitting.edges import EdgeCrops
 from ..fitting.keypoints import KeypointMatches
-from ..fitting.measured_fit import contour_evidence, measure_contours
+from ..fitting.measured_fit import edges_at, measure_contours
 from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.framing import CropFrame, shown_in
 from ..geometry.pose_prior import object_frame
@@ -322,10 +322,15 @@ def _agreeing_keypoints(described: Described, poses: Hypotheses) -> Tensor:
 
 
 def _contours(target: Target, described: Described, poses: Hypotheses) -> Tensor:
-    """(N,) see :func:`.contour_evidence`; 0 without the contour fit."""
+    """(N,) see :func:`.edge_excess`, measured where it is not known; 0 without the contour fit."""
     if described.crops is None:
         return torch.zeros(len(poses), dtype=torch.float64)
-    return by_contours(contour_evidence, target.describer, described.crops, poses)
+    excess = poses.edge_excess
+    unknown = excess.isnan().nonzero()[:, 0]
+    if not len(unknown):
+        return excess
+    _, measured = by_contours(edges_at, target.describer, described.crops, poses[unknown])
+    return excess.index_copy(0, unknown, measured)
 
 
 def with_details(

@@ -14,7 +14,7 @@ from ..fitting.contour_fit import fit_to_edges, short_fit
 from ..fitting.contour_problem import ContourProblem
 from ..fitting.devices import on_device
 from ..fitting.edges import EdgeCrops
-from ..fitting.measured_fit import ContourFit, contour_support
+from ..fitting.measured_fit import ContourFit, edges_at
 from ..fitting.texture_fit import fit_texture, rotated_starts
 from ..geometry.cameras import point_in_cameras, pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
@@ -59,6 +59,7 @@ class Hypotheses(Rows):
         covariance: (N, 6, 6) of a fit, NaN without one, see :func:`fit_contours`.
         edge_support, start_support: (N,) of a fit, NaN without one.
         observable: (N,) number of directions that a fit determines.
+        edge_excess: (N,) see :class:`.ContourFit`; NaN until it is measured at the pose.
         short_fit: (N, 4, 4) the poses after a :func:`short_fit`, NaN without one; those of starts.
         evidence: of them, 0 until it is measured.
         is_outside: (N,) bool, those that lie outside the limits of their photograph, one of each at
@@ -81,6 +82,7 @@ class Hypotheses(Rows):
     edge_support: Tensor
     start_support: Tensor
     observable: Tensor
+    edge_excess: Tensor
     short_fit: Tensor
     evidence: Evidence
     is_outside: Tensor
@@ -114,6 +116,7 @@ class Hypotheses(Rows):
             edge_support=nan,
             start_support=nan,
             observable=torch.zeros_like(view),
+            edge_excess=nan,
             short_fit=torch.full_like(T, torch.nan),
             evidence=Evidence.zeros(count),
             is_outside=none,
@@ -161,14 +164,19 @@ class Hypotheses(Rows):
     def fit(self) -> ContourFit:
         """The poses as a fit."""
         return ContourFit(
-            self.T, self.covariance, self.edge_support, self.start_support, self.observable
+            self.T,
+            self.covariance,
+            self.edge_support,
+            self.start_support,
+            self.observable,
+            self.edge_excess,
         )
 
     def with_fit(self, fit: ContourFit, centre: Tensor) -> "Hypotheses":
         """Return the poses of a fit, for an object with this centre (3,)."""
         measured = fit.columns()
         T = measured.pop("transform")
-        return placed(replace(self, **measured), T, centre)
+        return replace(placed(self, T, centre), **measured)
 
     def with_poses(self, index: Tensor, others: "Hypotheses") -> "Hypotheses":
         """Put the poses of ``others``, with their evidence, in the places ``index`` (M,); what is
@@ -192,11 +200,16 @@ class Hypotheses(Rows):
 
 
 def placed(poses: Hypotheses, T: Tensor, centre: Tensor) -> Hypotheses:
-    """Return the poses at ``T`` (H, 4, 4), with allocentric rotations and distances to match."""
+    """Return the poses at ``T`` (H, 4, 4), with allocentric rotations and distances to match, where
+    no edges are measured."""
     position = point_in_cameras(T, centre)
     rotation = rotation_towards(position).mT @ T[:, :3, :3]
     return replace(
-        poses, T=T, rotation=rotation, distance=torch.linalg.vector_norm(position, dim=1)
+        poses,
+        T=T,
+        rotation=rotation,
+        distance=torch.linalg.vector_norm(position, dim=1),
+        edge_excess=torch.full_like(poses.edge_excess, torch.nan),
     )
 
 
@@ -268,8 +281,9 @@ def fit_texture_of(
 
 
 def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses) -> Hypotheses:
-    """Poses that are not fitted, with their edge support, see :func:`contour_support`."""
-    return replace(poses, edge_support=by_contours(contour_support, describer, crops, poses))
+    """Poses that are not fitted, with their edges, see :func:`edges_at`."""
+    support, excess = by_contours(edges_at, describer, crops, poses)
+    return replace(poses, edge_support=support, edge_excess=excess)
 
 
 def common_score(hypothesis: Hypothesis, weights: EvidenceWeights) -> float:

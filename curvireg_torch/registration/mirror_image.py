@@ -17,9 +17,9 @@ from ..matching import Ranking
 from ..mesh.reflections import is_its_own_mirror_image
 from ..terms import QueryFeatures
 from ..utils.segments import best_within
-from .block import Block, described, fitted_poses, poses_of_best_views, with_evidence
+from .block import Block, described, poses_of_best_views, with_evidence
 from .confidence import resolution
-from .hypotheses import Hypotheses, by_contours, placed, with_short_fit
+from .hypotheses import Hypotheses, by_contours, fit_poses, placed, with_short_fit
 from .photograph import Photograph
 from .result import DETERMINING_KEYPOINTS, Registration
 from .target import Target
@@ -87,7 +87,13 @@ def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     if not len(rows):
         return highest
     poses = placed(fitted[rows], fitted.short_fit[rows], target.describer.centre)
-    poses = fitted_poses(target, seen, flipped_crops, poses, refit=True)
+    poses = fit_poses(
+        target.describer,
+        flipped_crops,
+        poses,
+        settings=replace(target.pipeline.fit, kept_starts=1),
+        short_fits=fitted.short_fit[rows],
+    )
     poses = with_evidence(target, seen, poses)
     weights = target.score_weights(exact=True)
     of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)

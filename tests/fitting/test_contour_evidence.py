@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 from curvireg_torch.fitting.edges import EdgeCrops
-from curvireg_torch.fitting.measured_fit import contour_evidence, contour_support
+from curvireg_torch.fitting.measured_fit import edges_at
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.rendering.contours import MeshContours
 from tests._support import double, eye, seeded
@@ -42,8 +42,8 @@ def measured(mesh, image, *T):
     poses = torch.stack(T or (FRONT,))
     crops = EdgeCrops.cut([image], BOX, 0.1)
     index = torch.zeros(len(poses), dtype=torch.long)
-    given = MeshContours(mesh), crops, K.expand(len(poses), 3, 3), poses, index
-    return contour_evidence(*given), contour_support(*given)
+    support, excess = edges_at(MeshContours(mesh), crops, K.expand(len(poses), 3, 3), poses, index)
+    return excess, support
 
 
 def test_the_outline_counts_by_its_strength_minus_that_beside_it():

@@ -13,7 +13,7 @@ from curvireg_torch.fitting.contour_fit import fit_to_edges, short_fit
 from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
 from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask
 from curvireg_torch.fitting.least_squares import apply_twist, project
-from curvireg_torch.fitting.measured_fit import contour_support
+from curvireg_torch.fitting.measured_fit import edges_at
 from curvireg_torch.geometry import axis_angle_from_rotation
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
@@ -246,8 +246,9 @@ def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
     assert int(fit.observable) == 6
     assert float(fit.start_support) < float(fit.edge_support)
     crops = EdgeCrops.cut([image], box[None], 0.1)
-    support = contour_support(contours, crops, camera[None], fit.transform, FIRST)
+    support, excess = edges_at(contours, crops, camera[None], fit.transform, FIRST)
     assert float(support) == pytest.approx(float(fit.edge_support), abs=0.03)
+    assert float(excess) == pytest.approx(float(fit.edge_excess), abs=0.03)
 
 
 def test_a_fit_begins_around_its_start_and_farther_away_if_it_is_a_second_one(monkeypatch):
@@ -352,14 +353,14 @@ def test_start_support_is_at_full_size_and_trustworthy_depends_on_support_or_gai
     off = double([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]])
     start = apply_twist(CUBE_POSE[None], off, mesh_centre(cube()))
     image = silhouette(cube(), CUBE_POSE)
-    expected = contour_support(MeshContours(cube()), cube_crops(), K[None], start, FIRST)
+    expected, _ = edges_at(MeshContours(cube()), cube_crops(), K[None], start, FIRST)
     fit = fitted(image, start)
     assert_close(fit.start_support, expected)
     assert fit.trustworthy
     assert not fitted(noise(), start).trustworthy
     none = torch.zeros(4)
     supports = (torch.tensor([0.51, 0.49, 0.35, 0.25]), torch.tensor([0.49, 0.45, 0.1, 0.1]))
-    made = ContourFit(none, none, *supports, none)
+    made = ContourFit(none, none, *supports, none, none)
     assert made.trustworthy.tolist() == [True, False, True, False]
 
 

@@ -120,9 +120,8 @@ def test_turned_starts_need_an_axis_that_contours_do_not_determine():
     covariance = torch.diag(double([0.1, 9.0, 0.1, 1e-4, 1e-4, 1e-4]))[None]
 
     def contours(covariance, observable):
-        return ContourFit(
-            TRUTH, covariance, torch.ones(1), torch.ones(1), torch.tensor([observable])
-        )
+        one = torch.ones(1)
+        return ContourFit(TRUTH, covariance, one, one, torch.tensor([observable]), one)
 
     assert rotated_starts(contours(covariance, 6), CENTRE).equal(TRUTH)
     assert rotated_starts(contours(covariance * torch.nan, 0), CENTRE).equal(TRUTH)

@@ -3,6 +3,7 @@ is the best."""
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,9 +13,15 @@ from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.matching import Ranking
-from curvireg_torch.registration.hypotheses import Hypotheses, best_views, distinct_poses
-from tests._support import CAMERA, scene, truck_bank, truck_registrar
-from tests._support.hypotheses import evidence_of, placed_at, poses_at
+from curvireg_torch.registration import block as block_module
+from curvireg_torch.registration.hypotheses import (
+    Hypotheses,
+    best_views,
+    distinct_poses,
+    placed,
+)
+from tests._support import CAMERA, double, scene, truck_bank, truck_registrar
+from tests._support.hypotheses import evidence_of, placed_at, poses_at, target_of
 
 WEIGHTS = EvidenceWeights.only(similarity=10.0)
 
@@ -49,6 +56,26 @@ def test_poses_take_their_places_with_their_evidence_and_what_is_known_of_the_pl
     changed = (after.T != before.T).flatten(1).any(dim=1)
     assert changed.tolist() == [False, True, False]
     assert after.is_outside.tolist() == [False, True, False]
+
+
+def test_edges_are_measured_once_at_a_pose(monkeypatch):
+    measured = []
+
+    def edges(_, __, ___, poses):
+        measured.append(len(poses))
+        return torch.zeros(len(poses)), torch.full((len(poses),), 0.7, dtype=torch.float64)
+
+    monkeypatch.setattr(block_module, "by_contours", edges)
+    crops = SimpleNamespace(crops=True)
+    poses = replace(poses_at(0.0, 90.0), edge_excess=double([0.2, torch.nan]))
+    target = target_of(describer=None)
+    assert block_module._contours(target, crops, poses).tolist() == [0.2, 0.7]
+    assert measured == [1]
+    elsewhere = placed(poses, poses.T.flip(0), torch.zeros(3).double())
+    assert block_module._contours(target, crops, elsewhere).tolist() == [0.7, 0.7]
+    known = replace(poses, edge_excess=double([0.2, 0.3]))
+    assert block_module._contours(target, crops, known).tolist() == [0.2, 0.3]
+    assert measured == [1, 2]
 
 
 def test_distinct_poses():
