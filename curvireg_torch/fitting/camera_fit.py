@@ -58,8 +58,8 @@ ASPECT = (0.5, -0.5, -0.5, 0.5, 0.0)
 @dataclass(frozen=True)
 class CameraPrior:
     """What is known of the cameras of N poses, with the ``powers`` of their unknown factors: the
-    logarithms of these are ``log_factor`` (N,), with a standard ``deviation``, and stay within
-    ``low`` and ``high`` (N,). Beyond ``reach``, the pull is constant."""
+    logarithms of these are ``log_factor`` (N,), with a standard ``deviation``, infinite if nothing
+    is known, and stay within ``low`` and ``high`` (N,). Beyond ``reach``, the pull is constant."""
 
     log_factor: Tensor
     deviation: float
@@ -102,8 +102,10 @@ def fit_camera(
     cameras = problem.K
     state = problem.state(T)
     for radius in radii:
-        information, _ = camera_information(problem, state, radius, matches, powers)
-        stiffness = information.scale / prior.deviation**2
+        stiffness = torch.zeros_like(log_factor)
+        if math.isfinite(prior.deviation):
+            information, _ = camera_information(problem, state, radius, matches, powers)
+            stiffness = information.scale / prior.deviation**2
         for _ in range(STEPS_PER_ROUND):
             uv, J = _projected(problem, state.T, state.points, powers)
             gap = prior.log_factor - log_factor
@@ -127,7 +129,7 @@ def fit_camera(
             state = replace(state, T=T)
             log_factor = new
             problem = replace(problem, K=scaled_cameras(cameras, log_factor, powers))
-        state = problem.state(state.T)
+        state = problem.with_current_contours(state)
     return CameraFit(problem, state, log_factor)
 
 

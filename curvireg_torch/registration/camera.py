@@ -364,9 +364,7 @@ WITHIN_REACH = 2.0 * CLEAR_DEVIATION
 """Standard deviation up to which, at the fitted pose, a focal length is worth a fit to contours. A
 fit lowers the deviation, to a third where the given one is 1.3 times the right focal length."""
 
-LARGEST_CHANGE = 2.0
-WIDE = 2.0
-"""Largest change of log f, and deviation of a prior that does not matter."""
+LARGEST_CHANGE = 2.0  # of the logarithm of an unknown factor
 
 
 def with_checked_cameras(
@@ -509,7 +507,7 @@ def _no_prior(cameras: Tensor, powers: Powers) -> CameraPrior:
     nothing = torch.zeros(len(cameras), dtype=torch.float64)
     low = nothing - LARGEST_CHANGE
     high = nothing + LARGEST_CHANGE
-    return CameraPrior(nothing, WIDE, low, high, powers=powers)
+    return CameraPrior(nothing, math.inf, low, high, powers=powers)
 
 
 def stretch_contradiction(gap: float, deviation: float) -> str | None:
