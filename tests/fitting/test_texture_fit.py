@@ -14,6 +14,7 @@ import curvireg_torch as cr
 from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.least_squares import apply_twist
+from curvireg_torch.fitting.measured_fit import edges_at
 from curvireg_torch.fitting.texture_fit import (
     CONVINCING_RATIO,
     _TextureRounds,
@@ -95,6 +96,11 @@ def test_label_determines_the_rotation_about_the_axis(renderer, degrees):
     assert int(found.observable) == 6
     about_axis = R[:, 1] @ found.covariance[0, :3, :3] @ R[:, 1]
     assert about_axis.sqrt().rad2deg() < 10.0
+    crops = EdgeCrops.cut([image()], BOX.float(), 0.1)
+    index = torch.zeros(1, dtype=torch.long)
+    support, excess = edges_at(CONTOURS, crops, CAMERA[None], found.transform, index)
+    assert float(found.edge_support) == pytest.approx(float(support), abs=0.01)
+    assert float(found.edge_excess) == pytest.approx(float(excess), abs=0.01)
 
 
 def test_a_label_is_found_without_red_and_the_last_round_draws_it_finer(renderer):
