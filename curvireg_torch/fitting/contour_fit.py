@@ -146,16 +146,18 @@ def fit_to_edges(
             (N,), that of the photograph of each start; None: all.
         wide_angles: degrees, see :func:`fit_contours`.
         short_fits: (N, 4, 4) poses of a :func:`short_fit` from the starts, if there was one.
-        refit: the starts are fitted poses. One is kept if the best fit at half size returns to it.
+        refit: the starts are fitted poses, which need no short fit. One is kept if the best fit at
+            half size returns to it.
         settings: of the fit.
     """
     full = ContourProblem.of(contours, crops, K, image_index)
     half = ContourProblem.of(contours, crops, K, image_index, factor=2)
-    if short_fits is None:
-        short_fits = _short_fits_around(contours, crops, K, T0, image_index, wide_angles)
     angles = (settings.start_angle, settings.far_angle) if refit else (settings.start_angle,)
-    rotated = _rotated(T0, half.centre, angles, roll=settings.start_roll)
-    around = torch.cat([rotated, short_fits.view(len(T0), -1, 4, 4)], dim=1)
+    around = _rotated(T0, half.centre, angles, roll=settings.start_roll)
+    if not refit:
+        if short_fits is None:
+            short_fits = _short_fits_around(contours, crops, K, T0, image_index, wide_angles)
+        around = torch.cat([around, short_fits.view(len(T0), -1, 4, 4)], dim=1)
 
     begun = half.state(T0)
     start_support, start_weighted = half.supports(begun)
