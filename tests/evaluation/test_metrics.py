@@ -203,18 +203,3 @@ def test_metrics_refuse_wrong_input():
     ):
         with refused(f"^{message}"):
             metrics.mspd_error(EST, GT, POINTS, camera, symmetries=symmetries)
-
-
-def test_the_largest_distance_of_one_pose_is_that_of_all_points():
-    """The point that moves farthest is none of those that bound the maximum."""
-    points = torch.zeros(2 * metrics.BOUNDING_POINTS, 3, dtype=torch.float64)
-    points[1] = torch.tensor([1.0, 0.0, 0.0])
-    quarter = eye(4)[None].clone()
-    quarter[0, :2, :2] = torch.tensor([[0.0, -1.0], [1.0, 0.0]])
-    identity = eye(4)[None].clone()
-    for pose in (quarter, identity):
-        pose[0, 2, 3] = 2.0
-    assert float(metrics.mssd_error(quarter, identity, points)) == pytest.approx(math.sqrt(2))
-    camera = torch.diag(double([100.0, 100.0, 1.0]))
-    mspd = float(metrics.mspd_error(quarter, identity, points, camera))
-    assert mspd == pytest.approx(50 * math.sqrt(2))

@@ -186,16 +186,6 @@ def test_cad_any_is_refused_for_objects_with_one_mesh_and_views_without_cameras(
         Pascal3DBenchmark(pascal, Protocol(views=2))
 
 
-@MATS_HERE
-@pytest.mark.parametrize("kind", ["pascal3d", "bop"])
-def test_score_without_results(tmp_path, instances, furniture, kind):
-    benchmark = instances[0] if kind == "bop" else furniture
-    n = len(benchmark.entries)
-    summary = scores_of(benchmark, tmp_path, [SKIPPED] * n)
-    assert (summary["n"], summary["skipped"]["x"]) == (0, n)
-    assert json.loads((tmp_path / "summary.json").read_text())["med_err_deg"] is None
-
-
 def test_pose_folders_score_known_poses(web):
     benchmark = PoseFolderBenchmark(web, ANY)
     half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))

@@ -388,20 +388,6 @@ LAMP = (334.0, 146.0, 711.0, 573.5)
 VGA3 = PictureSize((720, 960))
 
 
-def test_two_cameras_in_one_file_of_coco():
-    boxes = BoxFile(real_case("n23-coco-subfolders") / "annotations.json")
-    assert boxes.box(Path("cam2/000001.jpg"), lambda: VGA3) == pytest.approx(LAMP, abs=0.6)
-    assert boxes.box(Path("cam1/000001.jpg"), lambda: VGA3) == (39.5, 29.5, 239.5, 199.5)
-
-
-def test_labels_of_yolo_track():
-    labels = real_case("n20-yolo-track-id") / "labels"
-    with refused("a tracker's numbers"):
-        BoxFile(labels).box(Path("photo.jpg"), lambda: VGA3)
-    chosen = BoxFile(f"{labels}:id=1").box(Path("photo.jpg"), lambda: VGA3)
-    assert chosen == pytest.approx(LAMP, abs=0.6)
-
-
 def test_files_of_annotation_tools():
     folder = real_case("n25-annotation-tools")
     for name in ("labelme.json", "voc.xml"):

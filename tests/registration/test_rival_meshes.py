@@ -32,7 +32,7 @@ def truck(*, with_cabin=True):
 
 @cache
 def bank(*, with_cabin=True, scale=1.0):
-    return bank_around(truck(with_cabin=with_cabin).copy().apply_scale(scale), 30, [10, 30, 50])
+    return bank_around(truck(with_cabin=with_cabin).copy().apply_scale(scale), 30, [10, 40])
 
 
 def registered(shown, *banks):

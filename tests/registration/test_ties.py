@@ -52,7 +52,7 @@ def marked_box():
 
 @cache
 def registrar_of(mesh):
-    return exact_registrar(bank_around(mesh, 15, [10, 30, 50]))
+    return exact_registrar(bank_around(mesh, 30, [10, 30, 50]))
 
 
 def photograph(mesh, azimuth, elevation, seed):

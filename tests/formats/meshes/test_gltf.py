@@ -2,7 +2,6 @@
 
 import base64
 import json
-import math
 import time
 from typing import Any
 
@@ -224,22 +223,6 @@ def test_a_texture_without_coordinates_or_format_is_named(read):
     assert "lacks TEXCOORD_2" in read(tree)[1][0]
     tree.content["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
     assert "in a format that is not read" in read(tree)[1][0]
-
-
-def test_quantised_positions_and_places_of_nodes(read):
-    tree = Tree()
-    part = tree.part(BOX.faces)
-    part["attributes"]["POSITION"] = tree.array(
-        np.round(BOX.vertices * 2 * 1000), "h", normalized=True
-    )
-    tree.content["extensionsRequired"] = ["KHR_mesh_quantization"]
-    quarter = math.sqrt(0.5)
-    tree.content["nodes"] = [
-        {"children": [1], "translation": [10, 0, 0], "scale": [32.767 / 2] * 3},
-        {"mesh": 0, "rotation": [0, 0, quarter, quarter]},
-    ]
-    mesh, _ = read(tree)
-    assert_allclose(mesh.bounds, [[9, -1.5, -0.5], [11, 1.5, 0.5]], atol=1e-5)
 
 
 def test_morph_targets_are_named(read):

@@ -1,5 +1,6 @@
 """Polygons become triangles; what trimesh reads wrongly is rewritten or refused."""
 
+import itertools
 import struct
 
 import numpy as np
@@ -12,6 +13,8 @@ from curvireg_torch.formats.meshes.polygons import triangulated
 from tests._support.refusals import refused
 from tests.formats.meshes.test_ply import RGB
 
+CONVEX = np.array([[0, 0], [3, 0], [4, 2], [2, 4], [0, 2]], dtype=float)
+DART = np.array([[0, 0], [1, 2], [0, 1], [-1, 2]], dtype=float)
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
 
 
@@ -22,26 +25,35 @@ def square_with_hole(n):
     return np.concatenate([square, square[:1], hole, hole[:1]])
 
 
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("sign", [1, -1])
-def test_triangles_cover_polygons_once(axis, sign):
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+@pytest.mark.parametrize("signs", list(itertools.product([1, -1], repeat=2)))
+def test_triangles_cover_polygons_once_on_their_side_and_convex_ones_are_fans(order, signs):
+    """Vectors of area that add up to that of the polygon, and of which none is turned over."""
     rng = np.random.default_rng(0)
     turns = [
         np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, n))) * rng.uniform(0.2, 1, n)
         for n in (4, 5, 6, 9, 60)
     ]
     stars = [np.stack([turn.real, turn.imag], axis=-1) for turn in turns]
-    for flat in (U, *map(square_with_hole, (3, 8, 40)), *stars):
-        # in a tilted plane
-        polygon = np.insert(flat[::sign], axis, 0.3 * flat[::sign].sum(axis=1), axis=1)
-        # A plane over (u, v) of slope (0.3, 0.3): area grows by sqrt(1.18). Equal sums mean that
-        # none overlap.
-        corners = np.array([0, 1, 2, *range(len(polygon))])
-        picked, owner = triangulated(polygon, corners, np.array([3, len(polygon)]))
-        a, b, c = np.moveaxis(polygon[corners[picked[owner == 1]]], 1, 0)
-        (x, y), area = flat.T, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum()
-        expected = 0.5 * abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()))
-        assert area == pytest.approx(expected * 1.18**0.5, rel=1e-9)
+    for flat in (
+        CONVEX,
+        DART,
+        np.roll(DART, 1, axis=0),
+        U,
+        *map(square_with_hole, (3, 8, 40)),
+        *stars,
+    ):
+        tilted = (np.insert(flat, 2, 0.3 * flat.sum(axis=1), axis=1) * [*signs, 1])[:, order]
+        corners = np.array([0, 1, 2, *range(len(tilted))])
+        picked, owner = triangulated(tilted, corners, np.array([3, len(tilted)]))
+        faces = picked[owner == 1]
+        a, b, c = np.moveaxis(tilted[corners[faces]], 1, 0)
+        areas = np.cross(b - a, c - a)
+        whole = np.cross(tilted, np.roll(tilted, -1, axis=0)).sum(axis=0)
+        np.testing.assert_allclose(areas.sum(axis=0), whole, atol=1e-9)
+        assert (areas @ whole > 0).all()
+        if flat is CONVEX:
+            assert corners[faces].tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]]
 
 
 def prism():
