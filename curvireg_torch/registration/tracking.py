@@ -341,9 +341,10 @@ class Follower:
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
-        camera_matrix: (3, 3) in px, or a :class:`Camera`, of all frames. None estimates it, in the
-            frames that are registered until one is believed, whose camera is kept; distances are
-            then proportional to its focal length.
+        camera_matrix: (3, 3) in px, or a :class:`Camera`, of all frames. Without a size, it is that
+            of frames as large as the first one: it is scaled for those of other sizes, and another
+            aspect ratio is refused. None estimates it, in the frames that are registered until one
+            is believed, whose camera is kept; distances are then proportional to its focal length.
         prior: limits on the pose in frames that are registered.
 
     Example:
@@ -412,10 +413,22 @@ class Follower:
         check_tensor(T, "pose", (4, 4))
         check_pose(T, "pose")
         confidence = check_probability(confidence, "confidence")
-        item = as_photographs([image], None, self.camera_matrix)[0]
+        item = self._read(image)
         if not isinstance(item, Photograph):
             raise item
         map_on_threads(lambda item: self._start(item, T, confidence), [item])
+
+    def _read(
+        self, image: ImageLike, box: BoxLike | None = None, prior: PosePrior | None = None
+    ) -> Photograph | CurviregError:
+        """A frame. A camera without a size is that of frames as large as the first."""
+        boxes = None if box is None else [box]
+        item = as_photographs([image], boxes, self.camera_matrix, prior)[0]
+        camera = self.camera_matrix
+        if camera is not None and isinstance(item, Photograph):
+            camera = camera if isinstance(camera, Camera) else Camera(camera)
+            self.camera_matrix = replace(camera, size=camera.size or item.size)
+        return item
 
     def _start(self, item: Photograph, T: Tensor, confidence: float) -> None:
         self._tracker.start(item.image, item.K, T)
@@ -439,7 +452,7 @@ class Follower:
     def _next(self, image: ImageLike, box: BoxLike | None) -> Registration | FailedRegistration:
         if self._base is None:
             return self._registered(image, box, BELIEVED_CONFIDENCE)
-        item = as_photographs([image], None, self.camera_matrix)[0]
+        item = self._read(image)
         if not isinstance(item, Photograph):
             return FailedRegistration(item)
         tracked: TrackedPose | None = None
@@ -479,8 +492,7 @@ class Follower:
     ) -> Registration | FailedRegistration:
         """Register a frame; track from its pose if it lies within the frame, with a confidence of
         ``least``."""
-        boxes = None if box is None else [box]
-        item = as_photographs([image], boxes, self.camera_matrix, self.prior)[0]
+        item = self._read(image, box, self.prior)
         if not isinstance(item, Photograph):
             return FailedRegistration(item)
         result = self.registrar.register_prepared([item], detects=box is None)[0]

@@ -76,6 +76,21 @@ def test_follower_starts_from_a_known_pose_without_registering(monkeypatch):
         json.dumps(result.to_dict(), allow_nan=False)
 
 
+@pytest.mark.parametrize("starts", [True, False])
+def test_the_camera_of_the_first_frame_is_scaled_for_frames_of_another_size(starts):
+    (image, box, T), (second, second_box, second_T), (third, _, _) = sequence(3)
+    follow = Follower(learned_registrar(), CAMERA)
+    if starts:
+        follow.start(image, T)
+    else:
+        check_pose(follow(image, box), T)
+    larger = torch.nn.functional.interpolate(second[None], scale_factor=2.0, mode="bilinear")[0]
+    check_pose(follow(larger, 2.0 * second_box + 0.5), second_T)
+    failed = follow(third[:, :100])
+    assert not failed.ok
+    assert "calibrated for 240 x 180 px, but the photograph has 240 x 100 px" in str(failed.error)
+
+
 def answer(T, confidence):
     """A registration with this pose."""
     made = registration(confidence=confidence)
