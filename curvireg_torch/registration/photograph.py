@@ -50,10 +50,11 @@ SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
 FOCAL_RANGE = (1 / 3, 20.0)
 # Difference between the places of the principal point across and down, as fractions of the
 # picture's sides, up to which they count as one fraction, and from one half, from which the matrix
-# is that of another picture. Calibrations have the point within 0.05 of the middle; pictures of 2/3
-# and 1.6 times the size have it at 1/3 and 0.8
+# is that of another picture, and within which calibrations have it. Pictures of 2/3 and 1.6 times
+# the size have it at 1/3 and 0.8
 SAME_FRACTION = 0.03
 OFF_MIDDLE = 0.1
+NEAR_MIDDLE = 0.05
 # Relative difference of poses and cameras up to which two photographs come from the same place
 SAME_PLACE = 1e-4
 # Correlation of small copies of two photographs from which they may come from the same place
@@ -466,10 +467,12 @@ def camera_warnings(K: Tensor, size: tuple[int, int]) -> list[str]:
             f"{advice}"
         )
     elif (other := _size_of_matrix(K, size)) is not None:
+        is_turned = other == (W, H)
+        advice = "turn one of the two by 90 degrees" if is_turned else "scale it"
         found.append(
             f"the principal point ({cx:g}, {cy:g}) is not near the middle of the photograph of "
-            f"{W} x {H} px: the matrix seems to be of a picture of {other[1]} x {other[0]}; scale "
-            f"it"
+            f"{W} x {H} px: the matrix seems to be of a picture of {other[1]} x {other[0]}; "
+            f"{advice}"
         )
     low, high = FOCAL_RANGE
     focal = min(fx, fy)
@@ -490,12 +493,15 @@ def camera_warnings(K: Tensor, size: tuple[int, int]) -> list[str]:
 
 def _size_of_matrix(K: Tensor, size: tuple[int, int]) -> tuple[int, int] | None:
     """(H, W) of the picture whose middle is the principal point, if that is another size of the
-    photograph of ``size`` (H, W); else None."""
+    photograph of ``size`` (H, W), or the photograph turned by 90 degrees; else None."""
     sides = torch.tensor(size, dtype=torch.float64)
     middle = K[:2, 2].double().cpu().flip(0) + 0.5
-    down, across = (middle / sides).tolist()
+    aside = middle / sides - 0.5
+    if float((middle / sides.flip(0) - 0.5).abs().max()) <= NEAR_MIDDLE:
+        return size[::-1] if float(aside.abs().max()) >= OFF_MIDDLE else None
+    down, across = aside.tolist()
     is_one_fraction = abs(across - down) <= SAME_FRACTION
-    if not is_one_fraction or abs(0.5 * (across + down) - 0.5) < OFF_MIDDLE:
+    if not is_one_fraction or abs(0.5 * (across + down)) < OFF_MIDDLE:
         return None
     height, width = (2.0 * middle).round().int().tolist()
     return height, width

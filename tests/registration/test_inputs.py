@@ -40,6 +40,9 @@ def test_cameras_and_boxes_that_look_like_mistakes_are_questioned_or_refused():
         ((286, 286, 162.5, 120.5), ["seems to be of a picture of 326 x 242; scale it"]),
         ((381, 381, 216.5, 161.25), ["a picture of 434 x 324"]),
         ((915, 915, 520, 387.5), ["a picture of 1041 x 776"]),
+        # turned by 90 degrees, and not quite
+        ((572, 573, 260, 300), ["a picture of 480 x 640; turn one of the two by 90 degrees"]),
+        ((572, 573, 239.5, 353), []),
         # cropped, or within 0.1 of the middle
         ((572, 573, 162.5, 242), []),
         ((572, 573, 380, 288), []),
@@ -48,6 +51,8 @@ def test_cameras_and_boxes_that_look_like_mistakes_are_questioned_or_refused():
         assert bool(text) == bool(parts)
         for part in parts:
             assert part in text
+    nearly_square = camera_matrix(572, 573, 240, 260)
+    assert not camera_warnings(nearly_square, (480, 520))
     for box, refused, warned in (
         ([10, 10, 21.9, 200], True, True),
         ([10, 10, 22, 200], False, True),
