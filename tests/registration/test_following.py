@@ -11,7 +11,7 @@ import torch
 
 from curvireg_torch import Registrar
 from curvireg_torch.errors import LostObjectError
-from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.geometry import PosePrior, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import pose_around
 from curvireg_torch.pipeline import DetectionSettings
 from curvireg_torch.registration import FailedRegistration, Follower, refine, tracking
@@ -89,6 +89,23 @@ def test_the_camera_of_the_first_frame_is_scaled_for_frames_of_another_size(star
     failed = follow(third[:, :100])
     assert not failed.ok
     assert "calibrated for 240 x 180 px, but the photograph has 240 x 100 px" in str(failed.error)
+
+
+def test_limits_are_those_of_frames_that_are_registered(monkeypatch):
+    registered = Mock(return_value=[FailedRegistration(LostObjectError("lost"))])
+    refined = Mock(side_effect=LostObjectError("lost"))
+    monkeypatch.setattr(Registrar, "register_prepared", registered)
+    monkeypatch.setattr(tracking, "refine_one", refined)
+    (image, box, T), (second, _, _) = sequence(2)
+    prior = PosePrior(elevation=(0.0, 60.0))
+    follow = Follower(truck_registrar(), CAMERA, prior=prior)
+    follow(image, box)
+    (item,) = registered.call_args.args[0]
+    assert item.prior is prior
+    follow.start(image, T)
+    monkeypatch.setattr(follow._tracker, "track", LOST)
+    follow(second)
+    assert refined.call_args.args[1].prior is None
 
 
 def answer(T, confidence):
