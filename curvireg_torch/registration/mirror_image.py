@@ -87,13 +87,8 @@ def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     if not len(rows):
         return highest
     poses = placed(fitted[rows], fitted.short_fit[rows], target.describer.centre)
-    poses = fit_poses(
-        target.describer,
-        flipped_crops,
-        poses,
-        settings=replace(target.pipeline.fit, kept_starts=1),
-        short_fits=fitted.short_fit[rows],
-    )
+    settings = replace(target.pipeline.fit, kept_starts=1)
+    poses = fit_poses(target.describer, flipped_crops, poses, settings=settings)
     poses = with_evidence(target, seen, poses)
     weights = target.score_weights(exact=True)
     of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
