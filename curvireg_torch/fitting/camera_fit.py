@@ -205,12 +205,7 @@ def camera_information(
     """What edges within ``radius`` px, and ``matches``, tell of the logarithm of an unknown factor
     beyond what motions of the object could imitate, with errors as in :func:`pose_covariance`; and
     (N, 6), how the best pose moves with it."""
-    points = state.points
-    measured = problem.measured_edges(state, radius)
-    if matches is not None:
-        points = ContourPoints.cat_within([points, matches.points])
-        found = matches.measurements(state.T, problem.K, problem.centre, radius)
-        measured = Measurements.cat_within([measured, found])
+    measured, points = problem.measured(state, radius, matches)
     uv, by_all = _projected(problem, state.T, points, powers)
     J, by_camera = by_all.split([6, 1], dim=-1)
     W = measured.weight

@@ -11,6 +11,7 @@ from ..utils.rows import Rows
 from .edges import CROP_SIZE, EdgeCrops, EdgeField, ObjectMask
 from .least_squares import (
     Measurements,
+    PointMatches,
     apply_twist,
     damped_solution,
     pixels,
@@ -244,6 +245,18 @@ class ContourProblem(Rows):
         d = distance.gather(-1, index).double()
         W = strength.gather(-1, index) * (1.0 - (d / radius) ** 2).clamp(min=0.0) ** 2
         return Measurements(J, d, W)
+
+    def measured(
+        self, state: ContourState, radius: float, matches: PointMatches | None = None
+    ) -> tuple[Measurements, ContourPoints]:
+        """The :meth:`measured_edges`, then the ``matches`` with robust weights whose scale is the
+        ``radius``; and the points of the mesh that both belong to."""
+        edges = self.measured_edges(state, radius)
+        if matches is None:
+            return edges, state.points
+        found = matches.measurements(state.T, self.K, self.centre, radius)
+        points = ContourPoints.cat_within([state.points, matches.points])
+        return Measurements.cat_within([edges, found]), points
 
 
 def _offsets(radius: float) -> tuple[float, ...]:

@@ -11,7 +11,7 @@ from ..rendering.contours import MeshContours
 from ..utils.rows import Rows
 from .contour_problem import ContourProblem, ContourState
 from .edges import EdgeCrops
-from .least_squares import pixels, pose_covariance
+from .least_squares import PointMatches, pixels, pose_covariance
 
 FULL_SIZE_RADII = (4.0, 2.0, 2.0)
 """Search radius for edges in px at full size, one a round."""
@@ -67,14 +67,18 @@ class ContourFit(Rows):
 
 
 def measured_fit(
-    full: ContourProblem, state: ContourState, support: Tensor, before: Tensor
+    full: ContourProblem,
+    state: ContourState,
+    support: Tensor,
+    before: Tensor,
+    matches: PointMatches | None = None,
 ) -> ContourFit:
-    """A fit that ended in a ``state`` with its edge ``support`` (N,), that of its start being
-    ``before`` (N,)."""
-    edges = full.measured_edges(state, FULL_SIZE_RADII[-1])
+    """A fit, to edges and to ``matches`` if there are any, that ended in a ``state`` with its edge
+    ``support`` (N,), that of its start being ``before`` (N,)."""
+    measured, points = full.measured(state, FULL_SIZE_RADII[-1], matches)
     contours = full.contours
     covariance, observable = pose_covariance(
-        edges, state.points, state.T, full.K, contours.centre, radius=contours.radius
+        measured, points, state.T, full.K, contours.centre, radius=contours.radius
     )
     return ContourFit(
         state.T,

@@ -13,17 +13,14 @@ import torch
 from torch import Tensor
 
 from ..rendering import DepthRenderer
-from ..rendering.contours import ContourPoints
 from .contour_problem import ContourProblem
 from .least_squares import (
     MIN_MATCHES,
-    Measurements,
     PointMatches,
     apply_twist,
     fit_points,
-    pose_covariance,
 )
-from .measured_fit import FULL_SIZE_RADII, ContourFit, edge_excess
+from .measured_fit import FULL_SIZE_RADII, ContourFit, measured_fit
 
 # Corners of a view: how many at most, how many px apart at least, and the least strength as a
 # fraction of the strongest one's
@@ -115,21 +112,7 @@ def fit_texture(
     after = problem.edge_support(state)
     if bool(after < support - MAX_SUPPORT_LOSS):
         return None
-    joined = ContourPoints.cat_within([state.points, fine.matches.points])
-    found = fine.matches.measurements(state.T, problem.K, problem.centre, NEAR_ROUND[1][-1])
-    edges = problem.measured_edges(state, FULL_SIZE_RADII[-1])
-    both = Measurements.cat_within([edges, found])
-    covariance, observable = pose_covariance(
-        both, joined, state.T, problem.K, problem.centre, radius=problem.contours.radius
-    )
-    return ContourFit(
-        fine.T,
-        covariance,
-        edge_support=after,
-        start_support=support,
-        observable=observable,
-        edge_excess=edge_excess(problem, state),
-    )
+    return measured_fit(problem, state, after, support, fine.matches)
 
 
 def texture_matches(
