@@ -425,9 +425,11 @@ class Follower:
         boxes = None if box is None else [box]
         item = as_photographs([image], boxes, self.camera_matrix, prior)[0]
         camera = self.camera_matrix
-        if camera is not None and isinstance(item, Photograph):
-            camera = camera if isinstance(camera, Camera) else Camera(camera)
-            self.camera_matrix = replace(camera, size=camera.size or item.size)
+        if isinstance(item, Photograph) and camera is not None:
+            if not isinstance(camera, Camera):
+                self.camera_matrix = Camera(item.K, size=item.size)
+            elif camera.size is None:
+                self.camera_matrix = replace(camera, size=item.size)
         return item
 
     def _start(self, item: Photograph, T: Tensor, confidence: float) -> None:

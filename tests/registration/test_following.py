@@ -11,7 +11,7 @@ import torch
 
 from curvireg_torch import Registrar
 from curvireg_torch.errors import LostObjectError
-from curvireg_torch.geometry import PosePrior, rotation_from_axis_angle
+from curvireg_torch.geometry import Camera, PosePrior, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import pose_around
 from curvireg_torch.pipeline import DetectionSettings
 from curvireg_torch.registration import FailedRegistration, Follower, refine, tracking
@@ -89,6 +89,19 @@ def test_the_camera_of_the_first_frame_is_scaled_for_frames_of_another_size(star
     failed = follow(third[:, :100])
     assert not failed.ok
     assert "calibrated for 240 x 180 px, but the photograph has 240 x 100 px" in str(failed.error)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [CAMERA[None], CAMERA.numpy(), CAMERA.tolist(), Camera(CAMERA)],
+    ids=lambda given: type(given).__name__,
+)
+def test_cameras_of_all_forms_get_the_size_of_the_first_frame(given):
+    image, _, T = sequence(1)[0]
+    follow = Follower(truck_registrar(), given)
+    follow.start(image, T)
+    assert follow.camera_matrix.size == SIZE
+    assert follow.camera_matrix.matrix.equal(CAMERA)
 
 
 def test_limits_are_those_of_frames_that_are_registered(monkeypatch):
