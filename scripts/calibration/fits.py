@@ -1,7 +1,6 @@
 """Fits of confidences to measured rows, and how well they tell what is right."""
 
 from collections.abc import Mapping, Sequence
-from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -102,9 +101,14 @@ def fit_shares(rows: Sequence[Record], weight: Array, *, ties: bool) -> Record:
     pose is right and some are not; without ``ties`` the resolution is 0."""
     decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT_DEG]
 
+    most = max((len(rows[k]["scores"]) for k in decided), default=1)
+
     def filled(name: str, value: float) -> Array:
-        columns = zip_longest(*(rows[k][name] for k in decided), fillvalue=value)
-        return np.array(list(columns)).T
+        table = np.full((len(decided), most), value)
+        for place, k in enumerate(decided):
+            known = rows[k][name]
+            table[place, : len(known)] = known
+        return table
 
     scores = filled("scores", -np.inf)
     behind = scores.max(axis=1, keepdims=True) - scores

@@ -72,6 +72,8 @@ def test_shares_fit_recovers_slope_and_resolution():
     assert fitted["slope"] == pytest.approx(2.0, abs=0.5)
     assert fitted["resolution"] == pytest.approx(0.5, abs=0.21)
     assert fits.fit_shares(rows, np.ones(len(rows)), ties=False)["resolution"] == 0.0
+    none = fits.fit_shares([], np.ones(0), ties=True)
+    assert none["slope"] == pytest.approx(0.0, abs=0.05), "no photograph decides"
 
 
 def test_sets_of_furniture_are_left_out_where_there_is_none(tmp_path):
