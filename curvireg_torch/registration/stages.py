@@ -177,25 +177,25 @@ def _in_corrected_boxes(
     target: Target, items: Items, first: Mapping[int, Registration]
 ) -> dict[int, Registration]:
     """The ``first`` results of some photographs, by their numbers. One that is doubtful, or whose
-    box is far from that around its pose, is registered again in the latter, and if it is doubtful
-    still, in that around the second pose. What agrees best with it stands."""
+    box is far from that around its pose, is registered again in the latter, and if it is doubtful,
+    also in that around the second pose. What agrees best with the photograph stands."""
     best = dict(first)
-    tried = {k: [item] for k, item in enumerate(items) if isinstance(item, Photograph)}
-    weights = target.score_weights(exact=True)
-    for rank, reliable_overlap in enumerate(RELIABLE_OVERLAPS):
-        again: dict[int, Photograph] = {}
-        for k, result in first.items():
-            overlap = SAME_BOX_OVERLAP if best[k].is_doubtful else reliable_overlap
-            other_box = _in_box_of_pose(target, tried[k], result, rank, overlap)
+    again: list[tuple[int, Photograph]] = []
+    for k, result in first.items():
+        tried = [item for item in (items[k],) if isinstance(item, Photograph)]
+        for rank, reliable_overlap in enumerate(RELIABLE_OVERLAPS):
+            overlap = SAME_BOX_OVERLAP if result.is_doubtful else reliable_overlap
+            other_box = _in_box_of_pose(target, tried, result, rank, overlap)
             if other_box is not None:
-                again[k] = other_box
-                tried[k].append(other_box)
-        others = register_boxes(target, list(again.values()))
-        for (k, item), other in zip(again.items(), others, strict=True):
-            if not isinstance(other, Registration):
-                continue
-            if _agreement(other, weights) > _agreement(best[k], weights):
-                best[k] = replace(other, corrected_box=item.box.double())
+                again.append((k, other_box))
+                tried.append(other_box)
+    others = register_boxes(target, [item for _, item in again])
+    weights = target.score_weights(exact=True)
+    for (k, item), other in zip(again, others, strict=True):
+        if not isinstance(other, Registration):
+            continue
+        if _agreement(other, weights) > _agreement(best[k], weights):
+            best[k] = replace(other, corrected_box=item.box.double())
     return best
 
 
