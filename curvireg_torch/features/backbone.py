@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError, MissingDependencyError, MissingFileError
-from ..filters.operations import fill_missing
+from ..filters.operations import fill_missing, is_host_readable
 from ..utils.checks import check_colour_image
 from ..utils.files import cache_folder, keep_tensors, kept_tensors
 from ..utils.threads import map_on_threads
@@ -51,7 +51,7 @@ class _Conv(nn.Conv2d):
     def forward(self, x: Tensor) -> Tensor:
         k = self.kernel_size[0]
         s = self.stride[0]
-        if k == 1 and _computes_with_onednn(x):
+        if k == 1 and computes_with_onednn(x):
             return torch.mkldnn_convolution(x, self.weight, self.bias, (0, 0), (1, 1), (1, 1), 1)
         # The odd pixel as a zero in front of the filter: a padded copy of the image takes longer
         odd = [s == 2 and side % 2 == 0 for side in (x.shape[-1], x.shape[-2])]
@@ -63,15 +63,14 @@ class _Conv(nn.Conv2d):
         return F.conv2d(x, weight, self.bias, stride=s, padding=k // 2, groups=self.groups)
 
 
-def _computes_with_onednn(x: Tensor) -> bool:
+def computes_with_onednn(x: Tensor) -> bool:
     """Whether oneDNN is called for 1 x 1 convolutions. ``F.conv2d`` calls it for 16 images or more;
     with fewer, it rounds differently, and takes a third longer for five."""
     return (
-        x.dtype == torch.float32
-        and x.device.type == "cpu"
-        and torch.backends.mkldnn.is_available()
+        is_host_readable(x)
+        and x.dtype == torch.float32
         and not torch.is_grad_enabled()
-        and not torch.compiler.is_compiling()
+        and torch.backends.mkldnn.is_available()
     )
 
 
@@ -251,7 +250,9 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
 def similarity(photographs: Tensor, views: Tensor) -> Tensor:
     """(B, N) float32 in [-1, 1]: mean cosine of the cells of descriptors (B, D) of photographs and
     (N, D) of views."""
-    # Few views at a time: a float32 copy of all of them takes ten times as long as the product.
+    # Few views at a time: a float32 copy of all of them takes ten times as long as the product. A
+    # matrix product is rounded by the number of photographs and views.
+    each = photographs.float()[:, None]
     return torch.cat(
-        [photographs.float() @ few.float().T for few in views.split(VIEWS_AT_A_TIME)], dim=1
+        [torch.linalg.vecdot(each, few.float()) for few in views.split(VIEWS_AT_A_TIME)], dim=1
     )

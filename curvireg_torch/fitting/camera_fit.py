@@ -19,6 +19,7 @@ from .least_squares import (
     damped_solution,
     project,
     residual_variance,
+    shifts,
     summed_by_cells,
 )
 
@@ -176,7 +177,7 @@ def _projected(
     grown = (uv - problem.K[:, None, :2, 2]) * _as_tensor(powers)[..., None, :2]
     by_camera = (grown * points.normals).sum(dim=-1, keepdim=True)
     motion = _motion_with_camera(T, problem.centre, powers)
-    return uv, torch.cat([J, by_camera + J @ motion[..., None]], dim=-1)
+    return uv, torch.cat([J, by_camera + shifts(J, motion)], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,7 @@ def camera_information(
     J, by_camera = by_all.split([6, 1], dim=-1)
     W = measured.weight
     imitation = damped_solution(J.mT @ (W * J), J.mT @ (W * by_camera), 1e-6)
-    own = by_camera - J @ imitation[..., None]
+    own = by_camera - shifts(J, imitation)
     alone = Measurements(own, measured.distance, W)
     A, b = alone.equations()
     amount = A[:, 0, 0]

@@ -16,6 +16,7 @@ from .least_squares import (
     damped_solution,
     pixels,
     project,
+    shifts,
     step_fraction,
 )
 
@@ -176,7 +177,7 @@ class ContourProblem(Rows):
 
         step = solved(distance)
         for _ in range(SELECTIONS_PER_STEP - 1):
-            step = solved(distance - J @ step[..., None].to(J.dtype))
+            step = solved(distance - shifts(J, step.to(J.dtype)))
         return step
 
     def solution(self, A: Tensor, b: Tensor) -> Tensor:

@@ -41,7 +41,8 @@ class EdgeField:
         self._inside = torch.ones_like(crops[:, :1]) if inside is None else inside.to(crops)
         gradient = torch.stack([gx, gy], dim=2).flatten(1, 2) * self._inside
         self._gradient = _Pictures(gradient, "constant")
-        energy = gradient.square().sum(dim=(1, 2, 3))
+        # by channels: threads share out a single sum, which rounds it otherwise
+        energy = gradient.square().sum(dim=(2, 3)).sum(dim=1)
         area = self._inside.sum(dim=(1, 2, 3))
         self._level = (energy / area.clamp(min=1)).sqrt().clamp(min=1e-6)
 
@@ -62,16 +63,18 @@ class EdgeField:
         Returns:
             (N, P, L) float32 in [0, 1).
         """
-        size = self._gradient.side
-        gradient = self._gradient.along(uv, normals, offsets, image_index, size)
+        poses = _OfPictures(image_index, len(self._level))
+        normals = poses.spread(normals)
+        gradient = self._gradient.along(
+            poses, poses.spread(uv), normals, offsets, self._gradient.side
+        )
         gx = gradient[0::2]
         gy = gradient[1::2]
         nx, ny = normals.to(gx.dtype)[..., None, :].unbind(-1)
         across = (gx * nx).addcmul_(gy, ny).square_()
         cosine = across / (gx * gx).addcmul_(gy, gy).clamp_(min=1e-20)
         r = cosine.square_().mul_(across.sqrt_()).amax(dim=0)
-        strength: Tensor = r / (r + self._level[image_index, None, None])
-        return strength
+        return poses.joined(r / (r + self._level[poses.shown, None, None, None]))
 
     def counts(self, uv: Tensor, valid: Tensor, image_index: Tensor) -> Tensor:
         """(N, P) bool: ``valid`` points that count when the support of a pose is averaged, all but
@@ -114,8 +117,11 @@ class ObjectMask:
         """
         aside = MASK_DISTANCE * size
         at = tuple(offset + side for side in (-aside, aside) for offset in offsets)
-        probability = self._pictures.along(uv, points.normals, at, image_index, size)
-        inside, outside = probability[0].chunk(2, dim=-1)
+        poses = _OfPictures(image_index, len(self.probability))
+        probability = self._pictures.along(
+            poses, poses.spread(uv), poses.spread(points.normals), at, size
+        )
+        inside, outside = poses.joined(probability[0]).chunk(2, dim=-1)
         outline = (inside - outside).clamp(min=0.0)
         within = torch.minimum(inside, outside)
         is_outline = points.outline[..., None]
@@ -129,59 +135,80 @@ class ObjectMask:
 
 
 class _Pictures:
-    """Pictures (B, C, S, S), sampled along lines.
-
-    They lie below each other in one, with a border of a pixel around each, so that one call samples
-    all of them: zeros for ``padding`` "constant", or what is beside them for "replicate".
-    """
+    """Pictures (B, C, S, S), sampled along lines, with a border of a pixel around each: zeros for
+    ``padding`` "constant", or what is beside them for "replicate"."""
 
     def __init__(self, pictures: Tensor, padding: str) -> None:
         self.side = pictures.shape[-1]
         bordered = F.pad(pictures, (1, 1, 1, 1), mode=padding)
-        below = bordered.transpose(0, 1).flatten(1, 2)[None]
         # a quarter of the time of an edge field goes where channels are far apart
-        self.joined = below.contiguous(memory_format=torch.channels_last)
+        self.bordered = bordered.contiguous(memory_format=torch.channels_last)
 
     def along(
         self,
+        poses: "_OfPictures",
         uv: Tensor,
         normals: Tensor,
         offsets: tuple[float, ...],
-        image_index: Tensor,
         size: int,
     ) -> Tensor:
-        """(C, N, P, L) float32 values at L offsets in px from points (N, P, 2) along normals, in
-        the pictures ``image_index`` (N,); points and offsets refer to a side of ``size`` px."""
-        N, P, _ = uv.shape
-        L = len(offsets)
-        height, width = self.joined.shape[2:]
-        scale, shift, steps = _sampling(offsets, width, height, self.side / size, uv.device)
-        start = torch.addcmul(shift, uv, scale)
-        has_several = height > width
-        if has_several:
-            first_row = image_index[:, None] * (width * 2.0 / height)
-            start[..., 1] += first_row
+        """(C, B, M, P, L) float32 values at L offsets in px from points (B, M, P, 2) along normals,
+        of M poses in each picture; points and offsets refer to a side of ``size`` px."""
+        B, M, P, _ = uv.shape
+        C, width = self.bordered.shape[1:3]
+        scale, shift, steps = _sampling(offsets, width, self.side / size, uv.device)
+        lines = torch.cat([torch.addcmul(shift, uv, scale), scale * normals], dim=-1)
         # A matrix product is four times as fast as start + offset x normal with its short rows.
-        lines = torch.cat([start, scale * normals], dim=-1).float()
-        grid = (lines.flatten(0, 1) @ steps).view(N, P * L, 2)
-        if has_several:
-            lowest = (first_row + (1.0 / height - 1.0)).float()
-            highest = lowest + (width - 1) * 2.0 / height
-            grid[..., 1].clamp_(min=lowest, max=highest)
-        sampled = F.grid_sample(
-            self.joined, grid.view(1, N * P, L, 2), padding_mode="border", align_corners=False
+        grid = torch.bmm(lines.float().flatten(0, 1), steps.expand(B * M, -1, -1))
+        sampled: Tensor = F.grid_sample(
+            self.bordered[poses.shown],
+            grid.view(B, M * P, -1, 2),
+            padding_mode="border",
+            align_corners=False,
         )
-        return sampled.view(-1, N, P, L)
+        return sampled.view(B, C, M, P, -1).transpose(0, 1)
+
+
+class _OfPictures:
+    """N poses as a table (B, M) of those in each of the pictures ``shown``, with empty places where
+    one has fewer, so that one call samples all pictures."""
+
+    def __init__(self, image_index: Tensor, pictures: int) -> None:
+        first = 0
+        end = 1
+        if pictures > 1 and len(image_index):
+            first = int(image_index.min())
+            end = int(image_index.max()) + 1
+        self.shown = slice(first, end)
+        self.pictures = end - first
+        if self.pictures > 1:
+            row = image_index - first
+            is_in = row == torch.arange(self.pictures, device=row.device)[:, None]
+            number = is_in.cumsum(dim=1)
+            self.most = int(number[:, -1].max())
+            self.place = self.most * row + number.gather(0, row[None])[0] - 1
+
+    def spread(self, x: Tensor) -> Tensor:
+        """(B, M, ...) of the poses' (N, ...)."""
+        if self.pictures == 1:
+            return x[None]
+        table = x.new_zeros(self.pictures * self.most, *x.shape[1:])
+        table.index_copy_(0, self.place, x)
+        return table.view(self.pictures, self.most, *x.shape[1:])
+
+    def joined(self, table: Tensor) -> Tensor:
+        """(N, ...) of the poses' (B, M, ...)."""
+        return table.flatten(0, 1).index_select(0, self.place) if self.pictures > 1 else table[0]
 
 
 @lru_cache(maxsize=256)
 def _sampling(
-    offsets: tuple[float, ...], width: int, height: int, ratio: float, device: torch.device
+    offsets: tuple[float, ...], width: int, ratio: float, device: torch.device
 ) -> tuple[Tensor, Tensor, Tensor]:
     """From px, each of which is ``ratio`` px of a picture, to the units of grid_sample, in which
-    the sides of a picture are 2: (2,) the scale and the shift of points; and the (4, 2 L) matrix
-    that takes the scaled x and y of a point and its normal to places at L offsets."""
-    unit = torch.tensor([2.0 / width, 2.0 / height], dtype=torch.float64, device=device)
+    the sides of a picture are 2: the scale and the shift of points; and the (4, 2 L) matrix that
+    takes the scaled x and y of a point and its normal to places at L offsets."""
+    unit = torch.tensor(2.0 / width, dtype=torch.float64, device=device)
     scale = ratio * unit
     along = torch.tensor(offsets, dtype=torch.float32, device=device)
     steps = torch.stack([torch.ones_like(along), along])

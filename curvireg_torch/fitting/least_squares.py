@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..calibration import COVARIANCE_SCALE
@@ -36,8 +37,12 @@ class Measurements(Rows):
 
     def equations(self) -> tuple[Tensor, Tensor]:
         """Normal equations J^T W J (N, 6, 6) and J^T W d (N, 6, 1)."""
-        WJ = (self.weight * self.J).mT
-        return torch.bmm(WJ, self.J), torch.bmm(WJ, self.distance)
+        unknowns = self.J.shape[-1]
+        # A CPU rounds products of an odd size by their place in the batch.
+        J = F.pad(self.J, (0, 1)) if unknowns % 2 else self.J
+        WJ = (self.weight * J).mT
+        A = torch.bmm(WJ, J)[:, :unknowns, :unknowns]
+        return A, torch.bmm(WJ, self.distance)[:, :unknowns]
 
 
 @dataclass(frozen=True)
@@ -156,6 +161,12 @@ def apply_twist(T: Tensor, step: Tensor, centre: Tensor) -> Tensor:
     ``step[:, 3:]``."""
     R = rotation_from_axis_angle(step[:, :3]) @ T[:, :3, :3]
     return pose_around(R, point_in_cameras(T, centre) + step[:, 3:], centre)
+
+
+def shifts(J: Tensor, change: Tensor) -> Tensor:
+    """(N, P, 1) the products of derivatives (N, P, D) and changes (N, D)."""
+    # J @ change is rounded otherwise for N = 1.
+    return torch.bmm(change[:, None], J.mT).mT
 
 
 def nearest_rigid(T: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.rendering.contours import ContourPoints
-from tests._support import double, eye, seeded, uniform
+from tests._support import double, eye, seeded, skip_unless_products_are_exact, uniform
 from tests.fitting.cube import K, fitted, pose, silhouette
 
 ZERO = double([0.0, 0.0, 0.0])
@@ -227,3 +227,22 @@ def test_directions_are_known_where_errors_of_points_and_normals_tell_less(radiu
     A = J[0].T @ (0.5 * J[0])
     share = torch.linalg.eigvals(torch.linalg.solve(A + E, A)).real
     assert int(known) == int((share > 0.75).sum()) == expected
+
+
+@pytest.mark.parametrize("unknowns", [6, 7, 8])
+def test_products_of_a_pose_do_not_depend_on_the_batch(unknowns):
+    skip_unless_products_are_exact()
+    generator = seeded(0)
+    J = torch.randn(5, 96, unknowns, generator=generator)
+    distance, weight = torch.rand(2, 5, 96, 1, generator=generator)
+    change = torch.randn(5, unknowns, generator=generator)
+    measured = ls.Measurements(J, distance, weight)
+    A, b = measured.equations()
+    assert_close(A, (weight * J).mT @ J)
+    assert_close(b, (weight * J).mT @ distance)
+    shifts = ls.shifts(J, change)
+    assert_close(shifts, J @ change[..., None])
+    for n in range(5):
+        for of_pose, of_batch in zip(measured[n : n + 1].equations(), (A, b), strict=True):
+            assert of_pose[0].equal(of_batch[n])
+        assert ls.shifts(J[n : n + 1], change[n : n + 1])[0].equal(shifts[n])
