@@ -6,6 +6,7 @@ from torch.testing import assert_close
 
 import curvireg_torch as cr
 from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.registration import Follower
 from curvireg_torch.synthetic import example_mesh
 from tests._support import CAMERA, bank_of, scene, truck_bank
 
@@ -71,13 +72,18 @@ def test_presets_on_a_gpu(preset):
     assert float(torch.linalg.det(found.rotation)) == pytest.approx(1.0, abs=1e-4)
 
 
-def test_registrar_ignores_the_default_dtype():
-    image, box, _ = scene(0)
+def test_registrar_and_follower_ignore_the_default_dtype():
+    image, box, truth = scene(0)
     expected = cr.Registrar(truck_bank())([image], box[None], CAMERA)[0]
     torch.set_default_dtype(torch.float64)
     try:
-        result = cr.Registrar(truck_bank())([image], box[None], CAMERA)[0]
+        registrar = cr.Registrar(truck_bank())
+        result = registrar([image], box[None], CAMERA)[0]
+        follow = Follower(registrar, CAMERA)
+        follow.start(image, truth)
+        followed = follow(image)
     finally:
         torch.set_default_dtype(torch.float32)
     assert_close(result.transform, expected.transform, atol=1e-6, rtol=0.0)
     assert result.score == pytest.approx(expected.score, abs=1e-6)
+    assert cr.rotation_error(followed.rotation, truth[:3, :3]) < 4.0

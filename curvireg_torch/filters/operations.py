@@ -288,7 +288,8 @@ def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = 
     both: Any = (sigma, sigma)
     if isinstance(sigma, Tensor):
         both = sigma.to(x.dtype).clamp(min=MIN_TENSOR_SIGMA).expand(1, 2)
-    with full_precision(x), _without_tf32(x):
+    # kornia makes its kernel on the default device
+    with full_precision(x), _without_tf32(x), x.device:
         blurred: Tensor = gaussian_blur2d(x, 2 * radius + 1, both, "replicate")
     return blurred
 

@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_camera_matrix, check_last_axes, check_same_device, check_tensor
+from ..utils.checks import (
+    check_camera_matrix,
+    check_image,
+    check_last_axes,
+    check_same_device,
+    check_tensor,
+)
 from . import operations as ops
 from .curvilinear import apply_to_depth, default_to_x, dominant_eigenvector, scaled_direction
 from .modules import DepthModule
@@ -64,6 +70,7 @@ def _field_of_normals(
 ) -> Tensor:
     """Vectors along which the normal changes fastest, of a length that follows from the trace and
     half the eigenvalue difference of its structure tensor, and from the direction (vx, vy)."""
+    check_image(depth, "depth")
     if camera_matrix is not None:
         check_last_axes(camera_matrix, "camera_matrix", (3, 3))
         if camera_matrix.shape[:-2] in ((), (1,)):

@@ -24,6 +24,8 @@ INLIER_SCALE = 2.0  # Distance in px at which a point match counts a quarter
 MIN_MATCHES = 8  # Point matches that a pose needs
 # Levenberg-Marquardt damping of a fit to points alone, a fraction of the diagonal of J^T W J
 POINT_DAMPING = 1e-5
+# Added to a diagonal that may be 0; it must not count beside that of a translation in small units
+LEAST_INFORMATION = 1e-200
 
 
 @dataclass(frozen=True)
@@ -128,8 +130,7 @@ def damped_solution(A: Tensor, b: Tensor, damping: float) -> Tensor:
     measurements."""
     damped = A.clone()
     diagonal = damped.diagonal(dim1=-2, dim2=-1)
-    largest = diagonal.amax(dim=-1, keepdim=True)
-    diagonal += damping * diagonal + (1e-12 * damping * largest + 1e-12)
+    diagonal += damping * diagonal + LEAST_INFORMATION
     # without the check, which takes as long
     solution: Tensor = torch.linalg.solve_ex(damped, b).result[..., 0]
     return solution

@@ -18,8 +18,8 @@ LOG_RATIO_FACTOR = 0.3  # Factor of log ratios: neighbouring pixels are not inde
 LEARNING_RATE = 0.2  # Weight of a new frame in the histograms
 HALF_RATE_COUNT = 20.0  # Pixels of a sector with which it learns at half of the rate
 # Smooths along one channel; the first and the last level repeat beyond
-LEVEL_KERNEL = 0.6 * torch.eye(COLOUR_LEVELS) + sum(
-    0.2 * torch.ones(COLOUR_LEVELS - 1).diag(side) for side in (-1, 1)
+LEVEL_KERNEL = 0.6 * torch.eye(COLOUR_LEVELS, dtype=torch.float32) + sum(
+    0.2 * torch.ones(COLOUR_LEVELS - 1, dtype=torch.float32).diag(side) for side in (-1, 1)
 )
 LEVEL_KERNEL[0, 0] = LEVEL_KERNEL[-1, -1] = 0.8
 
@@ -71,9 +71,9 @@ class RegionModel:
     two sectors both count."""
 
     def __init__(self) -> None:
-        self._histograms = torch.zeros(2, SECTORS, BINS)
-        self._log_ratio = torch.zeros(DIRECTIONS * BINS)
-        directions = torch.arange(DIRECTIONS) * (SECTORS / DIRECTIONS)
+        self._histograms = torch.zeros(2, SECTORS, BINS, dtype=torch.float32)
+        self._log_ratio = torch.zeros(DIRECTIONS * BINS, dtype=torch.float32)
+        directions = torch.arange(DIRECTIONS).float() * (SECTORS / DIRECTIONS)
         apart = directions[:, None] - torch.arange(SECTORS)
         half_turn = 0.5 * SECTORS
         apart = (apart + half_turn) % SECTORS - half_turn
@@ -86,7 +86,7 @@ class RegionModel:
         colour, seen = _colours_at(bins, uv)
         row = torch.where(inside, 0, DIRECTIONS) + _nearest(directions)[:, None]
         place = row * BINS + colour
-        counts = torch.zeros(2, DIRECTIONS, BINS)
+        counts = torch.zeros(2, DIRECTIONS, BINS, dtype=torch.float32)
         counts.view(-1).index_add_(0, place.flatten(), seen.float().flatten())
         of_sectors = self._sectors.mT @ counts
         count = of_sectors.sum(dim=-1, keepdim=True)

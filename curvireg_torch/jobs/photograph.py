@@ -41,7 +41,7 @@ __all__ = ["RegisteredPhotograph", "register"]
 THUMBNAIL_SIDE = 480  # pixels of the overlay's longer side in a notebook
 
 
-@dataclass(frozen=True, repr=False, kw_only=True)
+@dataclass(frozen=True, repr=False, eq=False, kw_only=True)
 class RegisteredPhotograph(Registration):
     """A :class:`Registration` that knows its photograph, and so can be drawn and saved.
 
@@ -179,6 +179,8 @@ def register(
         )
     if not isinstance(mesh, Registrar):
         mesh = Registrar(mesh, pipeline=pipeline, progress=progress)
+    elif pipeline is not None:
+        raise InvalidInputError("pipeline: a Registrar has its own, leave it out")
     return register_entry(entry, prepare(entry, photo), mesh)
 
 

@@ -244,9 +244,11 @@ def _matcher_of(
 ) -> ViewMatcher:
     """The matcher of a mesh or a bank, or a given one; see :class:`Registrar`."""
     if isinstance(source, ViewMatcher):
-        if any(value is not None for value in (pipeline, field, views, settings)):
+        given = any(value is not None for value in (pipeline, field, views, settings, device))
+        if given or renderer != "auto":
             raise InvalidInputError(
-                "Registrar: pipeline, field, views and settings belong to the matcher"
+                "Registrar: pipeline, field, views, settings, renderer and device belong to the "
+                "matcher"
             )
         return source
     if not isinstance(source, ViewBank):

@@ -37,7 +37,7 @@ AXIS_TOLERANCE = 15.0  # Degrees within which two axes are the same answer
 MIRROR_ANGLE = 30.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Hypothesis:
     """One candidate pose of the object, in the mesh file's own frame and unit.
 
@@ -128,7 +128,7 @@ class Hypothesis:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Detection:
     """Where the object was found in a photograph that came without a box.
 
@@ -152,7 +152,7 @@ class Detection:
     responses: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Axis:
     """Where the axis of a nearly round object points, whatever its turn about it.
 
@@ -176,7 +176,7 @@ class Axis:
         return {**vars(self), "direction": self.direction.tolist()}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PhotographPose:
     """The pose in one of the photographs that an object was registered in together.
 
@@ -223,7 +223,7 @@ class _OfBest(Generic[Value]):
         return self if result is None else self._get(result.hypotheses[0])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Registration:
     """Poses of one object in one photograph. The attributes of the best :class:`Hypothesis` are
     attributes of the registration too; ``covariance`` and ``standard_deviations`` are None where it
@@ -530,7 +530,7 @@ def _finite(deviations: Tensor) -> list[float | None]:
     return [None if math.isinf(v) else v for v in deviations.tolist()]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FailedRegistration:
     """A photograph that could not be registered because of its ``error``, which access to a pose
     raises.

@@ -93,6 +93,10 @@ class MeshContours:
             self._edges[size] = MeshEdges(mesh, self.centre.numpy(), faces)
             mesh = self._mesh(size)
 
+    def __getstate__(self) -> dict[str, object]:
+        """All but what is computed on first use, with ray casters that cannot be copied."""
+        return {**vars(self), "_levels": {}}
+
     def to(self, device: torch.device | str) -> "MeshContours":
         """The contours of the same mesh on a device."""
         if torch.device(device) == self.device:

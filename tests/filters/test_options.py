@@ -56,6 +56,12 @@ def test_functions_and_constructors_reject_wrong_options(name, options, message)
     assert str(by_function.value) == str(by_module.value)
 
 
+def test_a_wrong_depth_is_named_before_its_camera():
+    for depth in (torch.ones(1, 1, 8, 8).numpy(), [[1.0]]):
+        with refused("depth: expected a torch.Tensor"):
+            filters.average_shading_gradient(depth, camera_matrix=torch.eye(3))
+
+
 def test_depth_layers_broadcast_masks():
     depth = depths(3)
     mask = torch.rand(24, 24, generator=seeded(0)) < 0.7
@@ -106,6 +112,15 @@ MODULES = {
     ),
     "mfc": (filters.MultiScaleFocusCurves, {"sigma": 0.9}, photos, {"sigma"}),
 }
+
+
+@pytest.mark.parametrize("name", list(MODULES))
+def test_layers_are_built_on_any_default_device_and_compute_on_that_of_the_image(name):
+    module, options, inputs, _ = MODULES[name]
+    image = inputs(1, 16)
+    expected = module(**options)(image)
+    with torch.device("meta"):
+        assert module(**options)(image).equal(expected)
 
 
 @pytest.mark.parametrize("name", list(MODULES))

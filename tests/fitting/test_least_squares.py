@@ -62,8 +62,12 @@ def test_long_steps_are_shortened(rotation, translation, fraction, behind):
 
 def test_damping_shortens_each_direction_alike():
     A = torch.diag(double([1.0, 100.0, 1e4, 1.0, 1.0, 1.0]))[None]
-    x = ls.damped_solution(A, A @ torch.ones(1, 6, 1, dtype=torch.float64), 0.25)
-    assert_close(x, torch.full((1, 6), 0.8, dtype=torch.float64))
+    units = torch.diag(double([1.0, 1.0, 1.0, 1e-12, 1e-12, 1e-12]))
+    for unit in (eye(6), units):
+        in_units = unit @ A @ unit
+        b = unit @ A @ torch.ones(1, 6, 1, dtype=torch.float64)
+        x = ls.damped_solution(in_units, b, 0.25)
+        assert_close(x @ unit, torch.full((1, 6), 0.8, dtype=torch.float64))
     assert ls.damped_solution(0 * A, torch.zeros(1, 6, 1).double(), 0.01).tolist() == [[0.0] * 6]
 
 

@@ -120,6 +120,8 @@ def test_a_bank_and_a_registrar_have_the_unit_and_the_axis_of_their_mesh(folder,
         cr.register(photo, folder / "learned.safetensors", **given)
     with refused("unit, up: of a mesh file"):
         cr.register(photo, learned_registrar(), **given)
+    with refused("pipeline: a Registrar has its own"):
+        cr.register(photo, learned_registrar(), pipeline=cr.Pipeline())
 
 
 @pytest.mark.slow

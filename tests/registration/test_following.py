@@ -3,6 +3,8 @@ are wrong."""
 
 import json
 import math
+import pickle
+from copy import deepcopy
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -49,6 +51,15 @@ def follower(registrar=None):
     follow = Follower(registrar or truck_registrar(), CAMERA)
     follow.start(image, T)
     return follow
+
+
+def test_a_follower_in_use_can_be_pickled_and_copied():
+    follow = follower()
+    copies = [pickle.loads(pickle.dumps(follow)), deepcopy(follow)]
+    image, _, _ = sequence(2)[1]
+    expected = follow(image)
+    for other in copies:
+        assert other(image).transform.equal(expected.transform)
 
 
 def test_follower_keeps_the_object_over_a_sequence():

@@ -214,8 +214,9 @@ def test_registrar_accepts_tensors_arrays_and_paths_and_rejects_bad_calls(tmp_pa
             registrar(images, boxes, camera)
     with refused("belong to the bank"):
         Registrar(truck_bank(), views=sample_views())
-    with refused("belong to the matcher"):
-        Registrar(ViewMatcher(truck_bank()), field=ImageGradient())
+    for option in ({"field": ImageGradient()}, {"renderer": "embree"}, {"device": "cpu"}):
+        with refused("belong to the matcher"):
+            Registrar(ViewMatcher(truck_bank()), **option)
     assert registrar([], []) == []
 
 
@@ -346,8 +347,8 @@ def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, confi
 
 
 def test_doubtful_photographs_are_registered_again(monkeypatch):
-    """In the box around the best pose, then in that around the second, each box once; of a reliable
-    answer, in the first, if it is far from the given one."""
+    """In the boxes around the best two poses, each box once; of a reliable answer, in the first, if
+    it is far from the given one."""
     plain = truck_answer()
     sure = replace(plain, probabilities=(plain.reliable_from,))
     doubtful = replace(plain, probabilities=(plain.reliable_from - 0.01,))
@@ -361,9 +362,12 @@ def test_doubtful_photographs_are_registered_again(monkeypatch):
     far = replace(two, probabilities=sure.probabilities)
     rough = BOX + torch.tensor([-0.04, 0.0, 0.0, 0.0]) * (BOX[2] - BOX[0])
     assert len(registered_in_boxes(monkeypatch, sure, box=rough)[1]) == 1
-    assert len(registered_in_boxes(monkeypatch, doubtful, sure, box=rough)[1]) == 2
-    for answers in ((far, sure), (two, sure), (same, doubtful)):
+    one = replace(doubtful, hypotheses=(right,))
+    assert len(registered_in_boxes(monkeypatch, one, sure, box=rough)[1]) == 2
+    for answers in ((far, sure), (same, doubtful)):
         assert len(registered_in_boxes(monkeypatch, *answers)[1]) == 2
+    better = registered_in_boxes(monkeypatch, two, sure, doubtful)
+    torch.testing.assert_close(better[0].corrected_box, double(better[1][1]))
     result, boxes = registered_in_boxes(monkeypatch, two, doubtful, sure)
     given, first, second = (double(box) for box in boxes)
     torch.testing.assert_close(given, WRONG.double())

@@ -162,3 +162,11 @@ def test_a_rotation_that_is_not_determined_is_not_reliable():
             judged = replace(result, confidence_features={"undetermined": undetermined})
             assert judged.reliable == (verdict == "reliable")
             assert judged.verdict == verdict
+
+
+def test_results_are_equal_to_themselves_alone():
+    """Fields are tensors, whose equality is no truth value."""
+    one, same = registration(), registration()
+    assert one in [same, one]
+    assert len({one, same, one}) == 2
+    assert one.hypotheses[0] != same.hypotheses[0]
