@@ -80,7 +80,7 @@ def test_a_mesh_that_is_its_own_mirror_image_is_not_compared(monkeypatch):
 def test_a_mirrored_mesh_is_not_sought_in_other_boxes(gain, boxes, monkeypatch):
     """In which the flipped photograph may be seen in a wrong one."""
     monkeypatch.setattr(mirror_image, "LEAST_CONFIDENCE", 0.0)
-    monkeypatch.setattr(mirror_image, "mirror_gain", lambda *_: double([gain]))
+    monkeypatch.setattr(mirror_image, "mirror_gain", lambda *given: double([gain] * len(given[-1])))
     registered = spied(monkeypatch, stages, "register_boxes")
     image, box, _ = scene(0)
     answer_of(truck_registrar(box_jitter=0.1), image, box + double([0.0, 0.0, 12.0, 12.0]))
