@@ -63,10 +63,10 @@ class EdgeField:
         Returns:
             (N, P, L) float32 in [0, 1).
         """
-        poses = _OfPictures(image_index, len(self._level))
-        normals = poses.spread(normals)
+        poses = _PosesByPicture(image_index, len(self._level))
+        normals = poses.as_table(normals)
         gradient = self._gradient.along(
-            poses, poses.spread(uv), normals, offsets, self._gradient.side
+            poses, poses.as_table(uv), normals, offsets, self._gradient.side
         )
         gx = gradient[0::2]
         gy = gradient[1::2]
@@ -74,7 +74,7 @@ class EdgeField:
         across = (gx * nx).addcmul_(gy, ny).square_()
         cosine = across / (gx * gx).addcmul_(gy, gy).clamp_(min=1e-20)
         r = cosine.square_().mul_(across.sqrt_()).amax(dim=0)
-        return poses.joined(r / (r + self._level[poses.shown, None, None, None]))
+        return poses.as_rows(r / (r + self._level[poses.shown, None, None, None]))
 
     def counts(self, uv: Tensor, valid: Tensor, image_index: Tensor) -> Tensor:
         """(N, P) bool: ``valid`` points that count when the support of a pose is averaged, all but
@@ -117,11 +117,11 @@ class ObjectMask:
         """
         aside = MASK_DISTANCE * size
         at = tuple(offset + side for side in (-aside, aside) for offset in offsets)
-        poses = _OfPictures(image_index, len(self.probability))
+        poses = _PosesByPicture(image_index, len(self.probability))
         probability = self._pictures.along(
-            poses, poses.spread(uv), poses.spread(points.normals), at, size
+            poses, poses.as_table(uv), poses.as_table(points.normals), at, size
         )
-        inside, outside = poses.joined(probability[0]).chunk(2, dim=-1)
+        inside, outside = poses.as_rows(probability[0]).chunk(2, dim=-1)
         outline = (inside - outside).clamp(min=0.0)
         within = torch.minimum(inside, outside)
         is_outline = points.outline[..., None]
@@ -146,7 +146,7 @@ class _Pictures:
 
     def along(
         self,
-        poses: "_OfPictures",
+        poses: "_PosesByPicture",
         uv: Tensor,
         normals: Tensor,
         offsets: tuple[float, ...],
@@ -162,16 +162,16 @@ class _Pictures:
         grid = torch.bmm(lines.float().flatten(0, 1), steps.expand(B * M, -1, -1))
         sampled: Tensor = F.grid_sample(
             self.bordered[poses.shown],
-            grid.view(B, M * P, -1, 2),
+            grid.view(B, M * P, len(offsets), 2),
             padding_mode="border",
             align_corners=False,
         )
-        return sampled.view(B, C, M, P, -1).transpose(0, 1)
+        return sampled.view(B, C, M, P, len(offsets)).transpose(0, 1)
 
 
-class _OfPictures:
-    """N poses as a table (B, M) of those in each of the pictures ``shown``, with empty places where
-    one has fewer, so that one call samples all pictures."""
+class _PosesByPicture:
+    """N poses as a table (B, M): M of each of the pictures ``shown``, B in a row, with empty places
+    where there are fewer. So one call samples all pictures, each with pixels of its own."""
 
     def __init__(self, image_index: Tensor, pictures: int) -> None:
         first = 0
@@ -188,7 +188,7 @@ class _OfPictures:
             self.most = int(number[:, -1].max())
             self.place = self.most * row + number.gather(0, row[None])[0] - 1
 
-    def spread(self, x: Tensor) -> Tensor:
+    def as_table(self, x: Tensor) -> Tensor:
         """(B, M, ...) of the poses' (N, ...)."""
         if self.pictures == 1:
             return x[None]
@@ -196,7 +196,7 @@ class _OfPictures:
         table.index_copy_(0, self.place, x)
         return table.view(self.pictures, self.most, *x.shape[1:])
 
-    def joined(self, table: Tensor) -> Tensor:
+    def as_rows(self, table: Tensor) -> Tensor:
         """(N, ...) of the poses' (B, M, ...)."""
         return table.flatten(0, 1).index_select(0, self.place) if self.pictures > 1 else table[0]
 
