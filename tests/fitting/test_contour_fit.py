@@ -20,7 +20,14 @@ from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.terms import crop_photographs
-from tests._support import double, eye, refused, seeded, slow_after
+from tests._support import (
+    double,
+    eye,
+    refused,
+    seeded,
+    skip_unless_products_are_exact,
+    slow_after,
+)
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, cube_crops, fitted, noise, pose, silhouette
 
 CENTRE = double([0.2, -0.1, 0.3])
@@ -294,6 +301,23 @@ def test_a_grey_photograph_counts_as_three_equal_channels():
     assert colour.edge_support > 0.1
     assert grey.edge_support.equal(colour.edge_support)
     assert grey.transform.equal(colour.transform)
+
+
+def test_edges_of_a_picture_are_the_same_alone_and_among_others(threads):
+    skip_unless_products_are_exact()
+    generator = seeded(0)
+    images = torch.rand(4, 3, 256, 256, generator=generator)
+    index = torch.tensor([3, 1, 3])
+    uv = 255.0 * torch.rand(3, 40, 2, generator=generator).double()
+    normals = F.normalize(torch.randn(3, 40, 2, generator=generator).double(), dim=-1)
+    threads(3)
+    together = EdgeField(images).strength(uv, normals, (-1.0, 0.5, 1.0), index)
+    threads(1)
+    for n, k in enumerate(index.tolist()):
+        edges = EdgeField(images[k : k + 1])
+        alone = edges.strength(uv[n : n + 1], normals[n : n + 1], (-1.0, 0.5, 1.0), FIRST)
+        assert alone[0].equal(together[n])
+        assert alone.amax() > 0.3
 
 
 def several():
