@@ -211,6 +211,8 @@ def _poses(
                     )
             result = follow(image, box)
         except CurviregError as error:
+            if follow is None and options.start is not None:
+                raise  # it would fail in each frame
             result = FailedRegistration(error)
         yield name, image, result, time.perf_counter() - begun
 

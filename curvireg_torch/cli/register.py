@@ -151,6 +151,8 @@ CONFLICTS = {
     "out",
     "start|views instances": "--start and --views are of one object; leave --instances out",
     "hypotheses start": "--start refines one pose; leave --hypotheses out",
+    "start !refine": "--start refines a pose; leave --no-refine out",
+    "views boxes": "the rig holds the boxes; leave --boxes out",
     **{
         f"{name} alone": f"--{name}: several processes share several photographs; leave it out for "
         "one result"
@@ -172,7 +174,7 @@ CONFLICTS = {
     "stamp !ros": "--stamp: of the messages of --format ros; give it too",
     "frame !ros": "--frame: of the messages of --format ros; give it too",
     "need !strict": "--need says what --strict asks for; give it too",
-    "format list": "--format {format}: of one result, in --out DIR",
+    "format !alone": "--format {format}: of one result, in --out DIR",
     "format !out": "--format {format}: of one result, in --out DIR",
     "tracker views": "--format {format}: a tracker starts in one camera, not in a rig's world",
     "format !views !camera !guess similar": f"--format {{format}}: {NO_CAMERA}",

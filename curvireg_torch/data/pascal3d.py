@@ -130,7 +130,8 @@ class Pascal3DPlus(ObjectDataset):
             if path.is_file():
                 text = path.read_text(encoding="utf-8-sig", errors="replace")
                 rows = map(str.split, text.splitlines())
-                return [row[0] for row in rows if row and row[1:2] != ["-1"]]
+                ids = [row[0] for row in rows if row and row[1:2] != ["-1"]]
+                return list(dict.fromkeys(ids))
         names = " or ".join(str(p.relative_to(self.root)) for p in self._list_files(category))
         raise MissingFileError(
             f"no image list {names}; {_README} shows the layout", subject=self.root

@@ -264,6 +264,14 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(
     assert check_poses(tmp_path / "out", frames)[0]["verdict"] == verdict
 
 
+def test_a_start_without_a_camera_ends_the_run_at_once(frames, follow, tmp_path, capsys):
+    words = ["--start", frames[0] / "start.json", "--out", tmp_path / "out"]
+    assert follow(*words, source="turn.avi", box=False) == 2
+    error = capsys.readouterr().err
+    assert "a start pose needs the camera; give it: --camera" in error
+    assert "not sure" not in error
+
+
 @pytest.mark.parametrize(("source", "code"), [("shots", 130), ("0", 0)])
 def test_follow_keeps_the_poses_before_an_interruption(
     frames, follow, tmp_path, monkeypatch, source, code

@@ -194,6 +194,22 @@ def test_options_of_videos_and_processes_are_taken():
     assert parse(["register", *words]).front == "x", "of the limits in its rows"
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("a.png b.png m.ply --format ros", "--format ros: of one result"),
+        ("shots/* m.ply --format visp", "--format visp: of one result"),
+        ("--list l.csv m.ply --format m3t", "--format m3t: of one result"),
+        ("a.png m.ply --start p.json --no-refine", "leave --no-refine out"),
+        ("--views r.csv m.ply --boxes b.json", "leave --boxes out"),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(words, said, capsys):
+    with pytest.raises(SystemExit):
+        parse(["register", *words.split(), "--out", "out"])
+    assert said in capsys.readouterr().err
+
+
 def test_the_pose_in_the_world_of_a_rig_is_no_start(folder, register_one, refused):
     pose = {"frame": "world", "rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1], "translation": [0, 0, 3]}
     (folder / "rig.json").write_text(json.dumps(pose))

@@ -89,7 +89,8 @@ def test_pascal3d_reads_image_sets_with_invalid_entries(root):
     lists = root / "Image_sets"
     lists.mkdir()
     lists.joinpath("car_pascal_tiny.txt").write_text(
-        "\ufeff2008_000001\n\n../car_pascal/2008_000001\n" + "x" * 5000 + "\n", encoding="utf-8"
+        "\ufeff2008_000001\n2008_000001 1\n\n../car_pascal/2008_000001\n" + "x" * 5000 + "\n",
+        encoding="utf-8",
     )
     dataset = Pascal3DPlus(root, "tiny")
     assert (len(dataset), dict(dataset.skipped)) == (1, {"missing_annotation": 2})
