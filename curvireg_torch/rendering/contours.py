@@ -373,8 +373,9 @@ def _spread_evenly(
     number = torch.repeat_interleave(places, output_size=views * len(columns))
     first = before[:-1].view(views, 2).index_select(1, columns.kind)
     whole = total.view(views, 2).index_select(1, columns.kind)
-    target = first + (columns.place.float() + 0.5) / columns.of_kind * whole
-    behind = end.index_select(0, number).view(size) - target
+    target = (columns.place.float() + 0.5) / columns.of_kind * whole
+    # within the chain: sums over all chains would round the target otherwise
+    behind = end.index_select(0, number).view(size) - first - target
     length_there = length.index_select(0, number).view(size)
     fraction = 1.0 - behind / length_there.clamp(min=1e-30)
     return number, fraction.clamp(0.0, 1.0).float(), whole > 0

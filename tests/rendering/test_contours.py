@@ -11,6 +11,7 @@ from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.rendering.contours import (
     MAX_OCCLUDING,
+    ContourPoints,
     MeshContours,
     _Columns,
     _evenly_chosen,
@@ -124,6 +125,16 @@ def test_a_pose_that_is_no_number_has_no_points_and_leaves_the_others_theirs():
     assert not together.valid[0].any()
     assert torch.equal(together.valid[1:], alone.valid)
     assert torch.equal(together.model[1:][alone.valid], alone.model[alone.valid])
+
+
+def test_points_of_a_pose_are_the_same_to_the_bit_among_others():
+    contours = MeshContours(stairs(1.0))
+    azimuths = torch.arange(300.0, dtype=torch.float64)
+    T = transform(rotation_from_viewpoint(azimuths, 20.0), double([0.0, 0.0, 6.0]).expand(300, 3))
+    together = contours.points(T, K[None], 128)
+    alone = ContourPoints.cat([contours.points(one, K[None], 128) for one in T.split(1)])
+    assert together.model.equal(alone.model)
+    assert together.normals.equal(alone.normals)
 
 
 def test_places_lie_evenly_along_the_edges_of_each_pose_and_kind():
