@@ -17,6 +17,7 @@ from curvireg_torch.rendering.contours import (
     _evenly_chosen,
     _spread_evenly,
 )
+from curvireg_torch.synthetic import example_mesh
 from tests._support import double, eye
 
 K = double([[220.0, 0, 63.5], [0, 220.0, 63.5], [0, 0, 1]])
@@ -128,9 +129,10 @@ def test_a_pose_that_is_no_number_has_no_points_and_leaves_the_others_theirs():
 
 
 def test_points_of_a_pose_are_the_same_to_the_bit_among_others():
-    contours = MeshContours(stairs(1.0))
-    azimuths = torch.arange(300.0, dtype=torch.float64)
-    T = transform(rotation_from_viewpoint(azimuths, 20.0), double([0.0, 0.0, 6.0]).expand(300, 3))
+    contours = MeshContours(example_mesh())
+    azimuths = torch.arange(500, dtype=torch.float64)
+    distance = double([0.0, 0.0, 4.0 * contours.radius])
+    T = transform(rotation_from_viewpoint(0.72 * azimuths, 20.0), distance.expand(500, 3))
     together = contours.points(T, K[None], 128)
     alone = ContourPoints.cat([contours.points(one, K[None], 128) for one in T.split(1)])
     assert together.model.equal(alone.model)
