@@ -55,17 +55,15 @@ class _Conv(nn.Conv2d):
             return torch.mkldnn_convolution(x, self.weight, self.bias, (0, 0), (1, 1), (1, 1), 1)
         # The odd pixel as a zero in front of the filter: a padded copy of the image takes longer
         odd = [s == 2 and side % 2 == 0 for side in (x.shape[-1], x.shape[-2])]
-        weight = (
-            F.pad(self.weight, [m for one in odd for m in (int(one), 0)])
-            if any(odd)
-            else self.weight
-        )
+        weight = self.weight
+        if any(odd):
+            weight = F.pad(weight, [m for one in odd for m in (int(one), 0)])
         return F.conv2d(x, weight, self.bias, stride=s, padding=k // 2, groups=self.groups)
 
 
 def computes_with_onednn(x: Tensor) -> bool:
-    """Whether oneDNN is called for 1 x 1 convolutions. ``F.conv2d`` calls it for 16 images or more;
-    with fewer, it rounds differently, and takes a third longer for five."""
+    """Whether convolutions call oneDNN. ``F.conv2d`` does for many or large images alone: with few
+    small ones it rounds differently, and takes a third longer."""
     return (
         is_host_readable(x)
         and x.dtype == torch.float32
