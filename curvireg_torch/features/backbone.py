@@ -44,15 +44,27 @@ _BLOCKS = [
 _OUTPUT_BLOCKS = ((3, 4), (8, 9, 10))
 
 
-class _Conv(nn.Conv2d):
+class OneDNNConv2d(nn.Conv2d):
+    """Convolution of a centred filter without dilation or groups, by oneDNN on a CPU where no
+    gradient is wanted. ``F.conv2d`` calls it for many or large images alone: with few small ones it
+    rounds differently, and takes a third longer."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        if not _computes_with_onednn(x):
+            return super().forward(x)
+        padding = [side // 2 for side in self.kernel_size]
+        return torch.mkldnn_convolution(x, self.weight, self.bias, padding, self.stride, (1, 1), 1)
+
+
+class _Conv(OneDNNConv2d):
     """Convolution with TensorFlow's "same" padding: an odd pixel is added on the right and at the
     bottom."""
 
     def forward(self, x: Tensor) -> Tensor:
         k = self.kernel_size[0]
         s = self.stride[0]
-        if k == 1 and computes_with_onednn(x):
-            return torch.mkldnn_convolution(x, self.weight, self.bias, (0, 0), (1, 1), (1, 1), 1)
+        if k == 1:
+            return super().forward(x)
         # The odd pixel as a zero in front of the filter: a padded copy of the image takes longer
         odd = [s == 2 and side % 2 == 0 for side in (x.shape[-1], x.shape[-2])]
         weight = self.weight
@@ -61,9 +73,7 @@ class _Conv(nn.Conv2d):
         return F.conv2d(x, weight, self.bias, stride=s, padding=k // 2, groups=self.groups)
 
 
-def computes_with_onednn(x: Tensor) -> bool:
-    """Whether convolutions call oneDNN. ``F.conv2d`` does for many or large images alone: with few
-    small ones it rounds differently, and takes a third longer."""
+def _computes_with_onednn(x: Tensor) -> bool:
     return (
         is_host_readable(x)
         and x.dtype == torch.float32

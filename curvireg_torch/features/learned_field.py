@@ -15,7 +15,7 @@ from ..errors import InvalidInputError, MissingFileError
 from ..filters import operations as ops
 from ..utils.checks import check_colour_image
 from ..utils.files import write_tensors
-from .backbone import assign_weights, computes_with_onednn
+from .backbone import OneDNNConv2d, assign_weights
 
 WEIGHTS = Path(__file__).with_name("learned_field.safetensors")
 # of WEIGHTS; other files are refused
@@ -61,20 +61,9 @@ def halved_angle(doubled: Tensor) -> Tensor:
     return (length[:, None] * torch.stack([x, torch.where(s < 0, -y, y)], dim=1)).to(doubled.dtype)
 
 
-class _Conv(nn.Conv2d):
-    def forward(self, x: Tensor) -> Tensor:
-        # F.conv2d leaves oneDNN for one small image, which takes longer and rounds differently.
-        if computes_with_onednn(x):
-            padding = [side // 2 for side in self.kernel_size]
-            return torch.mkldnn_convolution(
-                x, self.weight, self.bias, padding, self.stride, (1, 1), 1
-            )
-        return super().forward(x)
-
-
 def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(
-        _Conv(inputs, outputs, 3, stride, 1, bias=False),
+        OneDNNConv2d(inputs, outputs, 3, stride, 1, bias=False),
         nn.BatchNorm2d(outputs),
         nn.ReLU(inplace=True),
     )
@@ -84,7 +73,9 @@ class _Residual(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.body = nn.Sequential(
-            _conv(width, width), _Conv(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width)
+            _conv(width, width),
+            OneDNNConv2d(width, width, 3, 1, 1, bias=False),
+            nn.BatchNorm2d(width),
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -117,9 +108,9 @@ class FieldNetwork(nn.Module):
                 nn.Sequential(_conv(c, d, 2), _Residual(d), _Residual(d)),
             ]
         )
-        self.across = nn.ModuleList([_Conv(i, o, 1) for i, o in ((d, c), (c, b), (b, a))])
+        self.across = nn.ModuleList([OneDNNConv2d(i, o, 1) for i, o in ((d, c), (c, b), (b, a))])
         self.up = nn.ModuleList([_conv(c, c), _conv(b, b), _conv(a, a)])
-        self.head = _Conv(a, 3, 3, 1, 1)
+        self.head = OneDNNConv2d(a, 3, 3, 1, 1)
 
     def forward(self, image: Tensor) -> Tensor:
         x = 4.0 * (image - 0.5)

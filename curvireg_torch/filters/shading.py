@@ -70,8 +70,8 @@ def _field_of_normals(
 ) -> Tensor:
     """Vectors along which the normal changes fastest, of a length that follows from the trace and
     half the eigenvalue difference of its structure tensor, and from the direction (vx, vy)."""
-    check_image(depth, "depth")
     if camera_matrix is not None:
+        check_image(depth, "depth")
         check_last_axes(camera_matrix, "camera_matrix", (3, 3))
         if camera_matrix.shape[:-2] in ((), (1,)):
             camera_matrix = camera_matrix.expand(depth.shape[0], -1, -1)

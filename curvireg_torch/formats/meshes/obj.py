@@ -203,10 +203,11 @@ def _colours(
             painted.corners[own] = byte_colours(found.colour)
         texture = None if found.texture is None else source.texture_file(*spellings(found.texture))
         if texture is not None:
-            if not np.take(has_uv, own).all():
+            has_own = np.take(has_uv, own)
+            if not has_own.all():
                 lack = "faces of a textured material lack texture coordinates; they are shown "
                 source.warn("texture", f"{lack}in its plain colour")
-            own = own[np.take(has_uv, own)]
+            own = own[has_own]
             painted.corners[own] = 255  # beside a texture, exporters write any colour
             uv = np.nan_to_num(coordinates[uv_index[own]], posinf=0.0, neginf=0.0)
             painted = painted.with_texture(own, texture, uv * found.scale + found.offset)
