@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from ..rendering.contours import ContourPoints, MeshContours
 from ..utils.rows import Rows
-from .edges import CROP_SIZE, EdgeCrops, EdgeField, ObjectMask
+from .edges import CROP_SIZE, EdgeCrops, EdgeField, ObjectMask, PosesByPicture
 from .least_squares import (
     Measurements,
     PointMatches,
@@ -93,6 +94,11 @@ class ContourProblem(Rows):
             DENSITY[factor],
         )
 
+    @cached_property
+    def poses(self) -> PosesByPicture:
+        """The poses by crop."""
+        return PosesByPicture(self.image_index)
+
     @property
     def centre(self) -> Tensor:
         """(3,) of the object, about which poses rotate."""
@@ -158,7 +164,7 @@ class ContourProblem(Rows):
         J = J.to(distance.dtype)
         if self.mask is not None:
             strength = strength * self.mask.weights(
-                uv, points, _offsets(radius)[1:-1], self.image_index, self.size
+                uv, points, _offsets(radius)[1:-1], self.poses, self.size
             )
         # The logarithm of 0 takes ten times as long as that of other numbers.
         log = strength.clamp(min=NO_EDGE).log()
@@ -194,7 +200,7 @@ class ContourProblem(Rows):
         """Distances in px along the normals and strengths, both (N, P, L) float32, enough for a
         step; the strength is 0 where there is no edge."""
         offsets = _offsets(radius)
-        profile = self.edges.strength(uv, points.normals, offsets, self.image_index)
+        profile = self.edges.strength(uv, points.normals, offsets, self.poses)
         before = profile[..., :-2]
         here = profile[..., 1:-1]
         behind = profile[..., 2:]
@@ -219,7 +225,7 @@ class ContourProblem(Rows):
         plain = (near.amax(dim=-1).double() * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1)
         if self.mask is None:
             return plain, plain
-        near = near * self.mask.weights(uv, points, NEAR, self.image_index, self.size)
+        near = near * self.mask.weights(uv, points, NEAR, self.poses, self.size)
         most = self.mask.largest_weights(points) * counts  # a long outline alone is no support
         return plain, (near.amax(dim=-1).double() * counts).sum(dim=1) / most.sum(dim=1).clamp(
             min=1
@@ -234,7 +240,7 @@ class ContourProblem(Rows):
         """(N, P, 7) strengths at ``NEAR`` px along the normals, which fall with the distance from
         the point."""
         offsets = torch.tensor(NEAR, dtype=torch.float32, device=uv.device)
-        strength = self.edges.strength(uv, normals, NEAR, self.image_index)
+        strength = self.edges.strength(uv, normals, NEAR, self.poses)
         return strength * torch.exp(-0.5 * offsets**2)
 
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:

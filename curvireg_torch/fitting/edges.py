@@ -47,7 +47,7 @@ class EdgeField:
         self._level = (energy / area.clamp(min=1)).sqrt().clamp(min=1e-6)
 
     def strength(
-        self, uv: Tensor, normals: Tensor, offsets: tuple[float, ...], image_index: Tensor
+        self, uv: Tensor, normals: Tensor, offsets: tuple[float, ...], poses: "PosesByPicture"
     ) -> Tensor:
         """Strength of the image gradient across a contour, at offsets along its normals.
 
@@ -58,12 +58,11 @@ class EdgeField:
         Args:
             uv, normals: (N, P, 2) float64 pixels of the crops and unit vectors.
             offsets: L of them, px along the normals.
-            image_index: (N,) the crop of each pose.
+            poses: N of them, by crop.
 
         Returns:
             (N, P, L) float32 in [0, 1).
         """
-        poses = _PosesByPicture(image_index, len(self._level))
         normals = poses.as_table(normals)
         gradient = self._gradient.along(
             poses, poses.as_table(uv), normals, offsets, self._gradient.side
@@ -98,7 +97,7 @@ class ObjectMask:
         uv: Tensor,
         points: ContourPoints,
         offsets: tuple[float, ...],
-        image_index: Tensor,
+        poses: "PosesByPicture",
         size: int,
     ) -> Tensor:
         """How well edges at offsets along the normals of contour points agree with the mask.
@@ -117,7 +116,6 @@ class ObjectMask:
         """
         aside = MASK_DISTANCE * size
         at = tuple(offset + side for side in (-aside, aside) for offset in offsets)
-        poses = _PosesByPicture(image_index, len(self.probability))
         probability = self._pictures.along(
             poses, poses.as_table(uv), poses.as_table(points.normals), at, size
         )
@@ -146,7 +144,7 @@ class _Pictures:
 
     def along(
         self,
-        poses: "_PosesByPicture",
+        poses: "PosesByPicture",
         uv: Tensor,
         normals: Tensor,
         offsets: tuple[float, ...],
@@ -169,14 +167,15 @@ class _Pictures:
         return sampled.view(B, C, M, P, len(offsets)).transpose(0, 1)
 
 
-class _PosesByPicture:
-    """N poses as a table (B, M): M of each of the pictures ``shown``, B in a row, with empty places
-    where there are fewer. So one call samples all pictures, each with pixels of its own."""
+class PosesByPicture:
+    """N poses, of the pictures ``image_index`` (N,), as a table (B, M): M of each of the pictures
+    ``shown``, B in a row, with empty places where there are fewer. So one call samples all
+    pictures, each with pixels of its own."""
 
-    def __init__(self, image_index: Tensor, pictures: int) -> None:
+    def __init__(self, image_index: Tensor) -> None:
         first = 0
         end = 1
-        if pictures > 1 and len(image_index):
+        if len(image_index):
             first = int(image_index.min())
             end = int(image_index.max()) + 1
         self.shown = slice(first, end)

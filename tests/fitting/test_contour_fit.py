@@ -11,7 +11,7 @@ from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.fitting import contour_fit
 from curvireg_torch.fitting.contour_fit import fit_to_edges, short_fit
 from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
-from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask
+from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask, PosesByPicture
 from curvireg_torch.fitting.least_squares import apply_twist, project
 from curvireg_torch.fitting.measured_fit import edges_at
 from curvireg_torch.geometry import axis_angle_from_rotation
@@ -34,6 +34,7 @@ CENTRE = double([0.2, -0.1, 0.3])
 T = pose([0.3, -0.5, 0.2], [0.1, 0.2, 6.0])[None]
 HERE = (0.0,)
 FIRST = torch.tensor([0])
+ONE = PosesByPicture(FIRST)
 
 
 class ParabolicEdges:
@@ -128,12 +129,12 @@ def test_edge_strength_peaks_on_a_slanted_edge():
     here = double([[[32.0, 31.0]]])  # 0.2 px from the edge
     edges = EdgeField(image)
     offsets = tuple(range(-5, 6))
-    across = edges.strength(here, n, offsets, FIRST)[0, 0]
+    across = edges.strength(here, n, offsets, ONE)[0, 0]
     assert int(across.argmax()) == 5
     assert float(across[0]) < 0.1 * float(across[5])
-    along = edges.strength(here, n.flip(-1) * double([-1.0, 1.0]), offsets, FIRST)
+    along = edges.strength(here, n.flip(-1) * double([-1.0, 1.0]), offsets, ONE)
     assert along.max() < 0.01
-    assert edges.strength(here + 500, n, offsets, FIRST).max() == 0
+    assert edges.strength(here + 500, n, offsets, ONE).max() == 0
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -142,7 +143,7 @@ def test_edge_strength_falls_with_the_fifth_power_of_the_cosine_in_the_strongest
     angles = math.atan2(0.6, 0.8) + double([0.0, 0.3, -0.6, 1.0, math.pi / 2, math.pi])
     n = torch.stack([angles.cos(), angles.sin()], dim=-1)[None]
     here = double([31.5, 30.2]).expand(1, 6, 2)
-    strength = EdgeField(ramp[None]).strength(here, n, HERE, FIRST)[0, :, 0].double()
+    strength = EdgeField(ramp[None]).strength(here, n, HERE, ONE)[0, :, 0].double()
     r = strength / (1.0 - strength)  # in units of the crop's root mean square gradient
     cosine = (angles - angles[0]).cos().abs()
     assert_close(r / r[0], cosine**5, rtol=1e-3, atol=1e-4)
@@ -156,7 +157,7 @@ def test_edges_outside_the_photograph_do_not_count():
     uv = double([[[10.0, 20.0], [12.0, 40.0], [50.0, 20.0]]])
     n = double([1.0, 0.0]).expand(1, 3, 2)
     valid = torch.ones(1, 3, dtype=torch.bool)
-    assert (edges.strength(uv, n, HERE, FIRST)[0, :, 0] > 0).tolist() == [True, True, False]
+    assert (edges.strength(uv, n, HERE, ONE)[0, :, 0] > 0).tolist() == [True, True, False]
     assert edges.counts(uv, valid, FIRST).tolist() == [[True, True, False]]
     # with less than half of the points inside, all count
     few = uv.index_fill(1, torch.tensor([1]), 50.0)
@@ -189,16 +190,16 @@ def test_mask_weights_within_at_the_border_and_beyond_in_the_crop_of_each_pose()
         (False, -1.0, [0.3, 0.3, 1.0]),
     ):
         points = row_of_points(outline, direction)
-        weights = half_planes(128).weights(uv, points, offsets, FIRST, 256)
+        weights = half_planes(128).weights(uv, points, offsets, ONE, 256)
         assert weights[0, 0].tolist() == pytest.approx(expected)
     # Borders at 128 and 64 of 256 px are at 64 and 32 of 128 px; the mask is read 3 px to both
     # sides there.
     uv = double([[[31.5, 50.0]], [[63.5, 50.0]], [[31.5, 50.0]]])
-    index = torch.tensor([0, 0, 1])
-    found = half_planes(128, 64).weights(uv, row_of_points(True, 1.0, count=3), HERE, index, 128)
+    poses = PosesByPicture(torch.tensor([0, 0, 1]))
+    found = half_planes(128, 64).weights(uv, row_of_points(True, 1.0, count=3), HERE, poses, 128)
     assert found.flatten().tolist() == pytest.approx([0.6, 2.0, 2.0])
     off = (-2.4, 2.4, -3.6, 3.6)
-    found = half_planes(128).weights(uv[1:2], row_of_points(True, 1.0), off, FIRST, 128)
+    found = half_planes(128).weights(uv[1:2], row_of_points(True, 1.0), off, ONE, 128)
     assert found.flatten().tolist() == pytest.approx([2.0, 2.0, 0.6, 0.6])
 
 
@@ -311,11 +312,12 @@ def test_edges_of_a_picture_are_the_same_alone_and_among_others(threads):
     uv = 255.0 * torch.rand(5, 40, 2, generator=generator).double()
     normals = F.normalize(torch.randn(5, 40, 2, generator=generator).double(), dim=-1)
     threads(1)
-    together = EdgeField(images).strength(uv, normals, (-1.0, 0.5, 1.0), index)
+    by_picture = PosesByPicture(index)
+    together = EdgeField(images).strength(uv, normals, (-1.0, 0.5, 1.0), by_picture)
     threads(3)
     for n, k in enumerate(index.tolist()):
         edges = EdgeField(images[k : k + 1])
-        alone = edges.strength(uv[n : n + 1], normals[n : n + 1], (-1.0, 0.5, 1.0), FIRST)
+        alone = edges.strength(uv[n : n + 1], normals[n : n + 1], (-1.0, 0.5, 1.0), ONE)
         assert alone[0].equal(together[n])
         assert alone.amax() > 0.3
 
