@@ -145,4 +145,4 @@ class Evidence(Rows):
 
     def named(self, h: int) -> dict[str, float]:
         """The evidence of pose ``h`` by name, as a hypothesis reports it."""
-        return {name: float(column[h]) for name, column in self.columns().items()}
+        return dict(zip(self.columns(), self.table[h].tolist(), strict=True))

@@ -259,10 +259,9 @@ class _Resampling:
             high = int((centre + width).amax()) + 1 - self.first
             part = x[:, low:high].to(centres.dtype)
             part = part.div_(255.0) if x.dtype == torch.uint8 else part
-            samples = (
-                torch.arange(low, low + part.shape[1], device=centre.device, dtype=centre.dtype)
-                + self.first
-            )
+            begin = self.first + low
+            end = begin + part.shape[1]
+            samples = torch.arange(begin, end, device=centre.device, dtype=centre.dtype)
             parts.append(_triangle(samples, centre[:, None], width[:, None]).to(part) @ part)
         resampled = torch.cat(parts, dim=1)
         return resampled if order is None else resampled.index_select(1, order.argsort())

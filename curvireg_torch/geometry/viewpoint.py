@@ -159,8 +159,7 @@ def angles_between(R: Tensor, others: Tensor, symmetries: Tensor | None = None) 
         >>> angles_between(torch.eye(3)[None], half_turn[None], group).tolist()
         [[0.0]]
     """
-    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
-    equivalent = R[:, None] @ group.to(R)
+    equivalent = R[:, None] if symmetries is None else R[:, None] @ symmetries[:, :3, :3].to(R)
     traces = (equivalent.flatten(2) @ others.flatten(1).T).amax(dim=1)
     return torch.rad2deg((0.5 * (traces - 1.0)).clamp(-1.0, 1.0).acos())
 

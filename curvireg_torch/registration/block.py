@@ -511,13 +511,19 @@ def refitted(target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses) 
     different = []
     for photograph in poses.photograph[best].tolist():
         rows = poses.of(photograph)
-        some = poses[rows]
-        rivals = close_rivals(some, scores[rows], block.symmetries, behind=settings.close_score)
+        rivals = rows[
+            close_rivals(
+                poses.rotation[rows], scores[rows], block.symmetries, behind=settings.close_score
+            )
+        ]
         distinct = distinct_poses(
-            some[rivals], scores[rows][rivals], block.symmetries, angle=settings.same_pose_angle
+            poses.rotation[rivals],
+            scores[rivals],
+            block.symmetries,
+            angle=settings.same_pose_angle,
         )
-        close.append(rows[rivals])
-        different.append(rows[rivals[distinct][: settings.close_rivals]])
+        close.append(rivals)
+        different.append(rivals[distinct][: settings.close_rivals])
     rivals = torch.cat(close)
     if not len(rivals):
         return poses

@@ -305,7 +305,7 @@ def _to_be_fitted(
     if not tried:
         return scores.topk(min(1, inside)).indices
     best = scores.topk(min(FITTED, inside)).indices
-    rivals = close_rivals(poses, scores, block.symmetries, behind=behind)
+    rivals = close_rivals(poses.rotation, scores, block.symmetries, behind=behind)
     for index in best:
         near = are_near(poses.rotation[rivals], poses.rotation[index], block.symmetries)
         rivals = rivals[~near]

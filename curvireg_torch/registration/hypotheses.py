@@ -16,7 +16,7 @@ from ..fitting.devices import on_device
 from ..fitting.edges import EdgeCrops
 from ..fitting.measured_fit import ContourFit, edges_at
 from ..fitting.texture_fit import fit_texture, rotated_starts
-from ..geometry.cameras import point_in_cameras, pose_from_box, projected_boxes, rotation_towards
+from ..geometry.cameras import boxes_of, point_in_cameras, pose_from_box, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from ..pipeline import FitSettings
 from ..utils.rows import Rows
@@ -301,24 +301,24 @@ def are_repeated(views: Tensor, photograph: Tensor) -> Tensor:
 
 
 def distinct_poses(
-    poses: Hypotheses, score: Tensor, symmetries: Tensor | None = None, *, angle: float
+    rotations: Tensor, score: Tensor, symmetries: Tensor | None = None, *, angle: float
 ) -> Tensor:
-    """(H,) bool: False where a pose is within ``angle`` degrees of one with a higher ``score``
-    (H,)."""
+    """(H,) bool: False where the rotation of a pose, of (H, 3, 3), is within ``angle`` degrees of
+    one with a higher ``score`` (H,)."""
     order = score.argsort(descending=True, stable=True)
-    R = poses.rotation[order].float()
+    R = rotations[order].float()
     best_first = torch.arange(len(order))
     chosen = distinct_views(best_first, R, count=len(order), angle=angle, symmetries=symmetries)
     return torch.zeros(len(order), dtype=torch.bool).index_fill(0, order[chosen], True)
 
 
 def close_rivals(
-    poses: Hypotheses, scores: Tensor, symmetries: Tensor | None = None, *, behind: float
+    rotations: Tensor, scores: Tensor, symmetries: Tensor | None = None, *, behind: float
 ) -> Tensor:
-    """(R,) indices of other poses whose scores (H,) are less than ``behind`` below the best one,
-    best first."""
+    """(R,) indices of poses with other ``rotations`` than the best one, of (H, 3, 3), whose scores
+    (H,) are less than ``behind`` below its, best first."""
     best = int(scores.argmax())
-    same = are_near(poses.rotation, poses.rotation[best], symmetries)
+    same = are_near(rotations, rotations[best], symmetries)
     close = ~same & (scores > scores[best] - behind)
     order = torch.where(close, scores, -torch.inf).argsort(descending=True, stable=True)
     return order[: int(close.sum())]
@@ -327,7 +327,7 @@ def close_rivals(
 def projected_box(describer: ViewDescriber, projection: tuple[Tensor, Tensor]) -> Tensor:
     """(4,) float64 box around the projected mesh, px of the photograph."""
     T, K = projection
-    return projected_boxes(describer.hull, T[None], K)[0]
+    return boxes_of(describer.hull, T, K)
 
 
 def hypothesis_of(

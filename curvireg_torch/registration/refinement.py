@@ -190,7 +190,7 @@ def refine_one(
     evidence = evidence_of(target, described, poses)
     scores = evidence.scores(target.score_weights(exact=True))
     symmetries = target.symmetries_of(exact=True)
-    distinct = distinct_poses(poses, scores, symmetries, angle=settings.same_pose_angle)
+    distinct = distinct_poses(poses.rotation, scores, symmetries, angle=settings.same_pose_angle)
     order = scores.argsort(descending=True, stable=True)
     order = order[distinct[order]]
     best = order[:1]

@@ -15,7 +15,7 @@ from ..fitting.exactness import Exactness, exactness_of
 from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import PosePrior
-from ..geometry.viewpoint import rotation_error, viewpoint_from_rotation
+from ..geometry.viewpoint import angles_between, viewpoint_from_rotation
 from ..matching import Ranking
 from ..pipeline import FitSettings
 from .confidence import RELIABLE, two_decimals
@@ -586,7 +586,7 @@ def ambiguity(rotations: Tensor) -> str | None:
     if len(rotations) > 2:
         return "several"
     first, second = rotations.double()
-    if float(rotation_error(first, second)) >= HALF_TURN:
+    if float(angles_between(first[None], second[None])) >= HALF_TURN:
         return "half turn"
     # the optical axis at the three planes
     mirrored = first[2] * (1.0 - 2.0 * torch.eye(3, dtype=torch.float64))

@@ -505,14 +505,14 @@ def _with_texture(target: Target, block: Block, crops: EdgeCrops, poses: Hypothe
 def _merged(target: Target, block: Block, poses: Hypotheses) -> Hypotheses:
     """Poses that end where a better one of the photograph does are not distinct."""
     is_distinct = poses.is_distinct.clone()
-    weights = target.score_weights(exact=block.exact)
+    scores = poses.evidence.scores(target.score_weights(exact=block.exact))
     angle = target.pipeline.fit.same_pose_angle
     for p in range(len(block)):
         rows = poses.of(p)
         rows = rows[~poses.is_outside[rows]]
-        some = poses[rows]
-        scores = some.evidence.scores(weights)
-        is_distinct[rows] = distinct_poses(some, scores, block.symmetries, angle=angle)
+        is_distinct[rows] = distinct_poses(
+            poses.rotation[rows], scores[rows], block.symmetries, angle=angle
+        )
     return replace(poses, is_distinct=is_distinct)
 
 

@@ -125,11 +125,12 @@ class Target:
 
     def symmetries_of(self, *, exact: bool) -> Tensor | None:
         """(S, 4, 4) that were given, or those of the shape of an exact mesh; None if there are
-        none."""
-        if not exact or self.symmetries is not None:
+        none but the identity."""
+        if not exact or self.symmetries is not None or self.bank.mesh.has_colours:
             return self.symmetries
         with _SHAPE_LOCK:  # photographs share them
-            return None if self.bank.mesh.has_colours else mesh_symmetries(self.bank.mesh)
+            symmetries = mesh_symmetries(self.bank.mesh)
+        return symmetries if len(symmetries) > 1 else None
 
     def score_weights(self, *, exact: bool) -> EvidenceWeights:
         """What evidence counts for with an exact mesh, or with a similar one."""

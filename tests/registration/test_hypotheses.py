@@ -83,7 +83,7 @@ def test_distinct_poses():
         ([0.0, 14.0, 16.0, 180.0], [0.9, 0.8, 0.7, 0.6], [True, False, True, True]),
         ([0.0, 10.0], [0.1, 0.2], [False, True]),
     ):
-        are_distinct = distinct_poses(poses_at(*degrees), torch.tensor(score), angle=15.0)
+        are_distinct = distinct_poses(poses_at(*degrees).rotation, torch.tensor(score), angle=15.0)
         assert are_distinct.tolist() == expected
 
 
