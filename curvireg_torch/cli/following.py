@@ -24,6 +24,7 @@ from ..data.images import ANIMATED, frame_tensor
 from ..errors import CurviregError, ImageError, InvalidInputError
 from ..formats.boxes import pixel_box
 from ..geometry import Camera, undistorted
+from ..geometry.crops import check_boxes
 from ..jobs.entry import camera_of, entry_of, start_in_unit
 from ..jobs.lists import POSE_COLUMNS, find_photographs, is_video
 from ..jobs.opening import open_registrar
@@ -211,7 +212,7 @@ def _poses(
                     )
             result = follow(image, box)
         except CurviregError as error:
-            if follow is None and options.start is not None:
+            if follow is None and options.boxes is None:
                 raise  # it would fail in each frame
             result = FailedRegistration(error)
         yield name, image, result, time.perf_counter() - begun
@@ -224,8 +225,11 @@ def _box(
     for the object."""
     size = (image.shape[-2], image.shape[-1])
     if options.box is not None:
-        kind = options.box_format or "xyxy"
-        return list(pixel_box(options.box, kind, size)) if is_first else None
+        if not is_first:
+            return None
+        box = list(pixel_box(options.box, options.box_format or "xyxy", size))
+        check_boxes(torch.tensor([box]), [size])
+        return box
     video, _, number = name.rpartition("-")
     names = [name, f"{video}_{int(number) + 1}"] if number.isdecimal() else [name]
     found = (options.detected_box(text, size) for text in names)

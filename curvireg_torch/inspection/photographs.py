@@ -32,6 +32,7 @@ FILL = (0.2, 0.7)  # of the photographs' shorter side, by the object
 UPRIGHT = (-10.0, 60.0)  # Elevations from which an upright object is seen, degrees
 BOX_ERROR = 0.05  # Standard deviation of the box's edges, as a fraction of its sides
 BLUR = 1.2  # px, the largest standard deviation
+LARGEST_SEED = 2**63  # that a generator takes
 SHARP = 0.3  # px, below which nothing is blurred
 # Clutter: most objects beside and behind the object, their radii and distances from its centre as
 # a fraction of its radius
@@ -103,9 +104,9 @@ class PhotographGenerator:
     def __call__(self, index: int) -> GeneratedPhotograph:
         """Photograph number ``index``."""
         mesh = self.subject
-        generator = torch.Generator().manual_seed(1_000_003 * self.seed + index)
+        generator = torch.Generator().manual_seed((1_000_003 * self.seed + index) % LARGEST_SEED)
         # of its own: clutter changes nothing else
-        others = torch.Generator().manual_seed(1_000_033 * self.seed + index)
+        others = torch.Generator().manual_seed((1_000_033 * self.seed + index) % LARGEST_SEED)
         truth = _random_truth(mesh, generator, upright=self.upright)
         centre = point_in_cameras(truth, mesh_centre(mesh))
         radius = mesh_radius(mesh)

@@ -5,19 +5,19 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..data import read_image
+from ..errors import InvalidInputError
 from ..matching import cached_bank
 from ..mesh import as_mesh
 from ..pipeline import Pipeline
 from ..registration import Registrar
+from ..registration.photograph import as_photo
 from ..utils.aliases import Fields, Progress
-from ..utils.checks import check_integer
-from ..utils.likes import MeshLike
+from ..utils.checks import check_device, check_integer, check_pixels
+from ..utils.likes import ImageLike, MeshLike
 from ..utils.threads import one_torch_thread
 from .facts import MeshFacts, mesh_facts
 from .look_alikes import LookAlike, confused_sides, look_alikes
@@ -165,7 +165,7 @@ def inspect(
     pipeline: Pipeline | None = None,
     renderer: str = "auto",
     device: torch.device | str = "cpu",
-    backgrounds: Sequence[Any] = (),
+    backgrounds: Sequence[ImageLike] = (),
     clutter: bool = False,
     progress: Progress | None = None,
 ) -> Inspection:
@@ -180,7 +180,7 @@ def inspect(
         pipeline: settings; ``Pipeline().with_pose_prior("upright")`` for objects that stand as in
             their file.
         renderer, device: of the views, see :class:`Registrar`.
-        backgrounds: (3, H, W) pictures or paths, instead of generated ones.
+        backgrounds: pictures as :func:`register` takes them, instead of generated ones.
         clutter: other objects stand around the object, and at times in front of it.
         progress: called with the stage ("mesh", "bank", "look-alikes" or "photographs"), done and
             total, perhaps in another thread; to cancel, it may raise.
@@ -189,7 +189,9 @@ def inspect(
         the report; ``to_dict()`` is the content of ``inspect.json``.
 
     Raises:
-        InvalidInputError: a mesh that cannot be read, or a number below 0.
+        InvalidInputError: a mesh that cannot be read, a number below 0, or a ``pipeline`` beside a
+            :class:`Registrar`, which has its own.
+        ImageError: a background that cannot be read.
 
     Example:
         >>> import trimesh
@@ -198,8 +200,13 @@ def inspect(
         (True, True, None)
     """
     check_integer(n, "n", least=0)
-    report = progress or report_nothing
+    check_integer(seed, "seed", least=0)
+    check_device(device)
     registrar = mesh if isinstance(mesh, Registrar) else None
+    if registrar is not None and (pipeline is not None or renderer != "auto"):
+        raise InvalidInputError("pipeline, renderer: a Registrar has its own, leave them out")
+    pictures = [_background(picture) for picture in backgrounds]
+    report = progress or report_nothing
     report("mesh", 0, 1)
     clean = as_mesh(mesh) if not isinstance(mesh, Registrar) else mesh.bank.mesh
     facts = mesh_facts(clean)
@@ -217,7 +224,6 @@ def inspect(
         found = replace(found, pairs=pairs, registrar=registrar)
         if n == 0:
             return found
-        pictures = [_background(picture) for picture in backgrounds]
         upright = registrar.pipeline.views.pose == "upright"
         generate = PhotographGenerator(clean, seed, upright, pictures, clutter)
         trial = run_trial(
@@ -240,9 +246,10 @@ def look_alikes_of(registrar: Registrar, report: Progress) -> tuple[LookAlike, .
     )
 
 
-def _background(picture: Any) -> Tensor:
+def _background(picture: ImageLike) -> Tensor:
     """(3, H, W) float of the generated photographs' size."""
-    image = picture if isinstance(picture, Tensor) else read_image(picture)
+    image = as_photo(picture).image
     pixels = image.float() / 255.0 if image.dtype == torch.uint8 else image.float()
+    check_pixels(pixels, "of a background")
     resized = torch.nn.functional.interpolate(pixels[None], SIZE, mode="area")[0]
     return resized.expand(3, *SIZE)

@@ -1,5 +1,6 @@
 """A video of the poses of a followed object."""
 
+import math
 import warnings
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -16,6 +17,7 @@ from ..utils.arrays import Bytes
 from .contours import Drawn, draw_window
 from .overlay import VERDICT_COLOURS
 
+LARGEST_CLOCK = 65535  # MPEG-4: of frames a second times a power of ten that makes them whole
 _LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
 
 
@@ -79,9 +81,8 @@ class OverlayVideo(AbstractContextManager["OverlayVideo"]):
         # the codec needs even numbers
         self._size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        writer = cv2.VideoWriter(
-            str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, self._size
-        )
+        fps = round(self.fps, int(math.log10(LARGEST_CLOCK / self.fps)))
+        writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), fps, self._size)
         if not writer.isOpened():
             warnings.warn("this OpenCV has no MPEG-4 encoder; no overlay is written", stacklevel=3)
         return writer

@@ -272,6 +272,12 @@ def test_a_start_without_a_camera_ends_the_run_at_once(frames, follow, tmp_path,
     assert "not sure" not in error
 
 
+def test_a_box_outside_the_first_frame_ends_the_run_at_once(follow, tmp_path, capsys):
+    words = ["--box", 1000, 1000, 1100, 1100, "--out", tmp_path / "out"]
+    assert follow(*words, source="turn.avi", box=False) == 2
+    assert "entirely outside the" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("source", "code"), [("shots", 130), ("0", 0)])
 def test_follow_keeps_the_poses_before_an_interruption(
     frames, follow, tmp_path, monkeypatch, source, code

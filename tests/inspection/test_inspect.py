@@ -332,9 +332,32 @@ def test_expected_shares():
     assert expected.median_deg == 4.0
 
 
-def test_number_below_zero_is_refused():
-    with refused("n"):
-        cr.inspect(trimesh.creation.box((1, 2, 3)), n=-1)
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("n", -1),
+        ("seed", 1.5),
+        ("device", "nowhere"),
+        ("photograph", torch.zeros(4, 9, 9)),
+        ("pixels outside", np.full((9, 9, 3), 255.0)),
+    ],
+)
+def test_what_photographs_cannot_be_generated_with_is_refused_first(name, value, monkeypatch):
+    monkeypatch.setattr("curvireg_torch.inspection.report.mesh_facts", None)
+    option = {name: value} if isinstance(value, float | int | str) else {"backgrounds": [value]}
+    with refused(name, cr.CurviregError):
+        cr.inspect(trimesh.creation.box((1, 2, 3)), **option)
+
+
+def test_settings_beside_a_registrar_are_refused(small_bank):
+    for option in ({"pipeline": cr.Pipeline()}, {"renderer": "embree"}):
+        with refused("pipeline, renderer"):
+            cr.inspect(Registrar(small_bank), **option)
+
+
+def test_any_seed_gives_photographs():
+    generate = PhotographGenerator(trimesh.creation.box((1, 2, 3)), seed=10**15)
+    assert generate(0).image.any()
 
 
 def test_page_groups_symmetries_by_their_turn():

@@ -43,6 +43,13 @@ def test_overlay_video_has_every_frame(registered, tmp_path):
     assert np.abs(frames[3] - frames[0]).mean() < 12
 
 
+@pytest.mark.parametrize(("fps", "written"), [(119.907, 119.91), (23.976, 23.976)])
+def test_overlay_video_keeps_rates_that_mpeg_4_can_tell(registered, tmp_path, fps, written):
+    with OverlayVideo(tmp_path / "overlay.mp4", truck_registrar(), fps=fps) as video:
+        video.add(*registered)
+    assert Video(tmp_path / "overlay.mp4").fps == pytest.approx(written, abs=1e-4)
+
+
 def test_caption_says_how_sure_the_pose_is(registered):
     for confidence, expected in ((0.95, "reliable"), (0.6, "unsure"), (0.4, "no match")):
         result = replace(registered[1], probabilities=(confidence,))
