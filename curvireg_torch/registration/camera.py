@@ -335,19 +335,17 @@ def with_focal_deviation(
     return block.with_photographs(changed), poses
 
 
-CLEAR_DEVIATION = 0.2
+CLEAR_DEVIATION = 0.3
 """Standard deviation of log f up to which a photograph determines its focal length."""
 
-CONTRADICTION = 2.0
-"""Standard deviations from which a given focal length is named. Those that are stated are more than
-twice the errors where a fit finds the focal length."""
-
 SMALLEST_GAP = 0.14
-"""Difference of log f, 15 % of the distance, up to which a focal length is not named."""
-
-SMALLEST_STRETCH = 0.15
-"""Logarithm of a factor by which a photograph is stretched up to which it is not named. Scans of
-objects look stretched by up to 0.13; a picture of 5:4 that was made square is, by 0.22."""
+CONTRADICTION = 0.5
+GIVEN_CONTRADICTION = 2.0
+"""Difference of log f, 15 % of the distance, and how many standard deviations of a fit and of the
+given focal length beside it, from which that is named. Those of fits are three times their errors;
+the sum allows for scans, whose proportions are not quite those of the object. The first two also
+hold of the logarithm of a factor by which a photograph is stretched: scans look stretched by up to
+0.13, a picture of 5:4 that was made square is, by 0.22."""
 
 NOTICED_STEP = 0.02
 """First step of log f from which a focal length is fitted: with the right camera most first steps
@@ -478,12 +476,11 @@ def _fitted_to_contours(
     """Gaps and deviations (N,), see :func:`camera_gaps`, in this ``column`` (N,), by contours
     alone."""
     powers = UNKNOWN[column]
-    smallest = torch.tensor([SMALLEST_STRETCH, SMALLEST_GAP], dtype=torch.float64)[column]
     half = ContourProblem.of(describer.contours, crops, poses.cameras, poses.photograph, factor=2)
     coarse = fit_camera(half, poses.T, _no_prior(poses.cameras, powers), HALF_RADII)
     gap = coarse.log_factor
     deviation = torch.full_like(gap, torch.inf)
-    far = (gap.abs() > 0.5 * smallest).nonzero()[:, 0]
+    far = (gap.abs() > 0.5 * SMALLEST_GAP).nonzero()[:, 0]
     if not len(far):
         return gap, deviation
     some = poses[far]
@@ -520,7 +517,7 @@ def stretch_contradiction(gap: float, deviation: float) -> str | None:
         >>> stretch_contradiction(0.14, 0.02) is None
         True
     """
-    if abs(gap) <= max(CONTRADICTION * deviation, SMALLEST_STRETCH):
+    if abs(gap) <= SMALLEST_GAP + CONTRADICTION * deviation:
         return None
     side = "width" if gap > 0.0 else "height"
     return (
@@ -542,8 +539,8 @@ def focal_contradiction(
         >>> focal_contradiction(550.0, 0.1, 0.05) is None
         True
     """
-    needed = CONTRADICTION * (deviation**2 + given_deviation**2) ** 0.5
-    if abs(gap) <= max(needed, SMALLEST_GAP):
+    error = math.hypot(CONTRADICTION * deviation, GIVEN_CONTRADICTION * given_deviation)
+    if abs(gap) <= SMALLEST_GAP + error:
         return None
     shown = focal * torch.tensor(gap).exp().item()
     return (
