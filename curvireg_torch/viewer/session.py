@@ -76,7 +76,7 @@ class Session:
     mesh_facts: str = ""
     progress: tuple[str, int, int] = ("", 0, 1)
     cancelled: bool = False
-    _registrar: tuple[RegisterOptions, Registrar] | None = None
+    _registrar: tuple[tuple[Mesh | None, RegisterOptions], Registrar] | None = None
     _opening: threading.Lock = field(default_factory=threading.Lock)
 
     def load(self) -> None:
@@ -496,12 +496,13 @@ class Session:
             raise CurviregError("stopped")
 
     def open_registrar(self, request: RegisterOptions, report: Progress) -> Registrar:
-        """The registrar of a mesh and options; the last one is reused, and one thread at a time
-        builds one."""
-        key = registrar_key(request)
+        """The registrar of a mesh and options; the last one is reused until the mesh is opened
+        again, and one thread at a time builds one."""
+        options = registrar_key(request)
+        key = self.mesh, options
         with self._opening:
             if self._registrar is None or self._registrar[0] != key:
-                self._registrar = key, open_registrar(key, key.meshes, progress=report)
+                self._registrar = key, open_registrar(options, options.meshes, progress=report)
             return self._registrar[1]
 
 

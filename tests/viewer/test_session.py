@@ -275,6 +275,9 @@ def test_a_registrar_serves_requests_with_the_same_mesh_and_method(folder, monke
     for changes in ({"pose": "upright"}, {"meshes": (folder / "other.ply",)}):
         changed = replace(request, **changes)
         assert session.open_registrar(changed, report) == (changed.pose, changed.meshes)
+    first = session.open_registrar(request, report)
+    session.open_mesh(folder / "truck.ply")  # again: a material may have come beside it
+    assert session.open_registrar(request, report) is not first
 
 
 def test_the_box_of_a_detector_is_on_the_page(folder):
