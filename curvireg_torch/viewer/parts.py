@@ -4,6 +4,8 @@ import re
 from pathlib import Path, PurePosixPath
 from urllib.parse import quote, unquote
 
+from ..utils.choices import IMAGES
+
 PARTS = (".mtl", ".bin")  # files of no other use
 NAMING = (".obj", ".mtl", ".gltf", ".dae", ".ply", ".urdf", ".usda")  # formats that name files
 # formats that cannot be opened before their parts have come
@@ -14,10 +16,14 @@ MAX_NAMING_BYTES = 2**24  # of a file, in which names of others are looked for
 def place_part(path: Path, mesh: Path) -> bool:
     """Move an uploaded file to where a mesh, or a part of it beside it, names it.
 
-    False if none of them does: then the file stays where it is.
+    False if none of them does, or if a picture has come there already, which another photograph may
+    be called like: then the file stays where it is.
     """
-    for owner in (mesh, *mesh.parent.rglob("*.mtl")):
+    materials = filter(Path.is_file, mesh.parent.rglob("*.mtl"))
+    for owner in (mesh, *materials):
         if owner.suffix.lower() in NAMING and (place := _named_place(path.name, owner)):
+            if path.suffix.lower() in IMAGES and place.exists():
+                continue
             place.parent.mkdir(parents=True, exist_ok=True)
             path.replace(place)
             return True

@@ -138,7 +138,7 @@ class Workspace:
         except CurviregError as error:
             self._show(part, str(error))
         except OSError as error:
-            self._show(part, f"{error.strerror or error}; check the machine on which the page runs")
+            self._show(part, _of_this_machine(error))
         except Exception as error:  # a defect must not end the page; the terminal has the traceback
             traceback.print_exc()
             self._show(part, f"{type(error).__name__}: {error}; see the terminal")
@@ -215,6 +215,10 @@ class Workspace:
         try:
             await self._store(path, size, blocks)
             await self._open_upload(path)
+        except OutputError:
+            raise
+        except OSError as error:
+            self._show("file", f"{name}: {_of_this_machine(error)}")
         finally:
             del self.receiving[path.parent]
             self._remove_unused()
@@ -248,7 +252,6 @@ class Workspace:
     async def _open_upload(self, path: Path) -> None:
         suffix = path.suffix.lower()
         session = self.session
-        rig = self.session.rig_path
         kinds = (*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip")
         if await self._add_to_mesh(path):
             return
@@ -269,12 +272,12 @@ class Workspace:
                 await self.set_option("unit", "mm")  # of BOP sets
             await self.open_rig(path.parent if path.name == "scene_camera.json" else path)
         elif (
-            rig is not None
+            (rig := session.rig_path) is not None
             and (not session.rig or path.name in RIG_PARTS)
             and suffix in CALIBRATIONS
         ):
             path.replace((rig if rig.is_dir() else rig.parent) / path.name)
-            await self.open_rig(rig)
+            await self.run("rig", lambda: session.open_rig(session.rig_path), stop=True)
         elif suffix in CALIBRATIONS:
             await self.run(
                 "camera", lambda: session.set_camera(load_camera(path)), stop=True, keep=True
@@ -391,6 +394,11 @@ class Workspace:
         self._version += 1
         self.files[name] = (content, media_type)
         return f"file/{name}?v={self._version}"
+
+
+def _of_this_machine(error: OSError) -> str:
+    """What is said of an error of the system; its own text has paths of the machine."""
+    return f"{error.strerror or error}; check the machine on which the page runs"
 
 
 def _cannot_store(name: str, error: OSError) -> OutputError:

@@ -192,6 +192,20 @@ def test_without_the_rig_photographs_are_registered_alone_again(workspace, rig):
     assert session.request().box == (1.0, 2.0, 30.0, 40.0)
 
 
+def test_a_calibration_that_comes_while_its_rig_goes_is_that_of_the_photographs(
+    workspace, rig, tmp_path, monkeypatch
+):
+    async def removed(_):
+        await workspace.open_rig(None)
+        return False
+
+    send(workspace, rig[0], "rig.csv")
+    monkeypatch.setattr(workspace, "_add_to_mesh", removed)
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 240 180 260 260 119.5 89.5\n")
+    session = send(workspace, tmp_path, "cameras.txt")
+    assert (workspace.messages, isinstance(session.options.camera, Camera)) == ({}, True)
+
+
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [

@@ -204,6 +204,19 @@ def test_what_a_mesh_names_is_part_of_it_and_no_photograph(workspace, scene):
     assert workspace.session.mesh_facts.endswith("rendered in its colours")
     send(workspace, scene / "photo.png", "plywood.png")
     assert names(workspace) == ["plywood.png"], "only a whole name counts"
+    send(workspace, scene / "photo.png", "wood.png")
+    assert names(workspace) == ["plywood.png", "wood.png"], "its picture has come already"
+    assert (workspace.session.mesh_path.parent / "maps" / "wood.png").read_bytes() == picture()
+
+
+def test_a_part_without_a_place_is_a_message(workspace, scene):
+    """A folder has the name of a material, and a file that of a folder."""
+    send(workspace, pack(scene / "a.zip", {"a.obj": TEXTURED, "old.mtl/a.txt": b""}))
+    send(workspace, scene / "photo.png")
+    assert names(workspace) == ["photo.png"]
+    send(workspace, scene, "a.obj", TEXTURED.replace(b"a.mtl", b"a.obj/a.mtl"))
+    send(workspace, scene, "a.mtl", b"newmtl m\n")
+    assert workspace.messages["file"].startswith("a.mtl: File exists; check the machine")
 
 
 def test_a_gltf_waits_for_its_buffer(workspace, tmp_path):
