@@ -1,6 +1,7 @@
 """The server of the viewer: its secret address, what it refuses, the page, its files and
 uploads."""
 
+import asyncio
 import errno
 import ipaddress
 import logging
@@ -60,7 +61,8 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
     token."""
     # The page's shutdown removes what is in the folder; a job that still runs may add to it.
     uploads = tempfile.TemporaryDirectory(prefix="curvireg-view-", ignore_cleanup_errors=True)
-    logging.getLogger("nicegui").addFilter(is_worth_saying)
+    for name in ("nicegui", "uvicorn.error"):
+        logging.getLogger(name).addFilter(is_worth_saying)
     with terminable(), listen(host, port) as listener, uploads as folder:
         workspace = Workspace(options, Path(folder))
         workspace.load()  # errors come before anything opens
@@ -75,8 +77,13 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
 
 
 def is_worth_saying(record: logging.LogRecord) -> bool:
-    """False for NiceGUI's complaint, on a busy machine, that tasks end late when the page ends."""
-    return not record.getMessage().startswith("Could not cancel")
+    """False for complaints that tasks end late when the page ends: of NiceGUI on a busy machine,
+    and of uvicorn about uploads on their way."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not (
+        isinstance(error, asyncio.CancelledError)
+        or record.getMessage().startswith(("Could not cancel", "Cancel "))
+    )
 
 
 def make_server(

@@ -33,6 +33,7 @@ from .parts import PARTS, WAITING, place_part
 from .session import STATIC, UNPACKED, Session
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
+STALL_SECONDS = 60.0  # without a byte, after which an upload has failed
 MAX_ARCHIVE_DEPTH = 32  # folders around a file in a zip archive
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 RIG_PARTS = ("cameras.txt", "scene_gt.json", "scene_gt_info.json")
@@ -68,7 +69,7 @@ class Workspace:
         messages: errors and warnings about a part of the work: "file", "photograph", "rig", "mesh",
             "camera", "pose", or the "page" itself.
         files: pictures and downloads by name, with their media types.
-        receiving: folders, names and sizes of files that are being received.
+        receiving: folders and names of files that are being received, and the bytes to come.
         started: when the search began, in seconds of ``time.monotonic``.
     """
 
@@ -239,13 +240,16 @@ class Workspace:
         received = 0
         try:
             with path.open("wb") as file:
-                async for block in blocks:
+                while block := await asyncio.wait_for(anext(blocks, b""), STALL_SECONDS):
                     received += len(block)
                     if received > size:  # in chunks, a request may send more than it has announced
                         raise InvalidInputError(
                             f"{path.name}: larger than announced; send it again"
                         )
                     await asyncio.to_thread(file.write, block)
+                    self.receiving[path.parent] = path.name, size - received
+        except TimeoutError:
+            raise InvalidInputError(f"{path.name}: it did not arrive; send it again") from None
         except OSError as error:
             raise _cannot_store(path.name, error) from error
 
@@ -285,6 +289,7 @@ class Workspace:
         elif suffix == ".zip":
             unpacked = partial(unpack, path, path.parent / UNPACKED)
             if mesh := await self.run("mesh", unpacked, keep=True):
+                path.unlink()  # only its content counts
                 await self.open_mesh(mesh, keep=True)
         elif suffix in MESHES_AND_BANKS:
             await self.open_mesh(path, keep=True)

@@ -220,8 +220,11 @@ def test_the_server_answers_plain_requests(address):
 def test_ctrl_c_on_a_busy_machine_says_nothing(caplog):
     log = logging.getLogger("nicegui")
     log.addFilter(is_worth_saying)
+    cancelled = asyncio.CancelledError()
     try:
         log.error("Could not cancel %s tasks within timeout: %s", 7, "")
+        log.error("Cancel %s running task(s), timeout graceful shutdown exceeded", 1)
+        log.error("Exception in ASGI application\n", exc_info=cancelled)
         log.error("disk full")
     finally:
         log.removeFilter(is_worth_saying)

@@ -273,7 +273,15 @@ def test_uploads_are_bounded_and_not_larger_than_announced(workspace, scene, mon
 
     with refused(r"^x\.png: larger than announced"):
         asyncio.run(workspace.receive("x.png", 5, blocks()))
-    assert stored(workspace) == []
+
+    async def stalled():
+        yield b"12"
+        await asyncio.Event().wait()
+
+    with monkeypatch.context() as patch, refused(r"^x\.png: it did not arrive; send it again"):
+        patch.setattr(module, "STALL_SECONDS", 0.01)
+        asyncio.run(workspace.receive("x.png", 5, stalled()))
+    assert (stored(workspace), workspace.receiving) == ([], {})
     size = (scene / "photo.png").stat().st_size
     monkeypatch.setattr(module, "MAX_VIEWER_BYTES", 2 * size)
     send(workspace, scene / "photo.png")
@@ -297,6 +305,7 @@ def test_a_mesh_without_its_texture_is_not_called_coloured(workspace, tmp_path):
     send(workspace, pack(tmp_path / "a.zip", {**parts, "a.png": picture()}))
     assert workspace.session.mesh_facts.endswith("rendered in its colours")
     assert workspace.messages == {}
+    assert sorted(stored(workspace)) == ["a.mtl", "a.obj", "a.png"], "without the archive"
     send(workspace, pack(tmp_path / "a.zip", {**parts, "a.png": b"%!PS-Adobe-3.0 EPSF-3.0\n"}))
     assert workspace.session.mesh_facts.endswith(facts)
 
@@ -609,23 +618,26 @@ def test_closing_ends_the_search_and_removes_the_uploads(workspace, scene, searc
     assert (stored(workspace), workspace.messages) == ([], {"pose": "stopped"})
 
 
-def test_files_on_their_way_count_with_what_they_announced(workspace, monkeypatch):
-    monkeypatch.setattr(module, "MAX_VIEWER_BYTES", 100)
+@pytest.mark.parametrize("blocks", [(0, 60_000), (30_000, 30_000), (60_000, 0)])
+def test_files_on_their_way_count_once_with_what_they_announced(workspace, monkeypatch, blocks):
+    monkeypatch.setattr(module, "MAX_VIEWER_BYTES", 100_000)
 
     async def work():
         begun = asyncio.Event()
         released = asyncio.Event()
 
         async def slow():
+            if blocks[0]:
+                yield b"x" * blocks[0]
             begun.set()
             await released.wait()
-            yield b"x" * 60
+            yield b"x" * blocks[1]
 
-        first = asyncio.create_task(workspace.receive("a.pdf", 60, slow()))
+        first = asyncio.create_task(workspace.receive("a.pdf", 60_000, slow()))
         await begun.wait()
-        with refused(r"^b\.pdf: all files have more than 100 bytes"):
-            await upload(workspace, None, "b.pdf", b"x" * 41)
-        await upload(workspace, None, "c.pdf", b"x" * 40)
+        with refused(r"^b\.pdf: all files have more than 100,000 bytes"):
+            await upload(workspace, None, "b.pdf", b"x" * 40_001)
+        await upload(workspace, None, "c.pdf", b"x" * 40_000)
         released.set()
         await first
 
