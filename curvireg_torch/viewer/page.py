@@ -62,7 +62,7 @@ def build_page(workspace: Workspace) -> None:
         stage = Stage(workspace)
         with region("div", "side"):
             steps = Steps(workspace)
-            answers = Answers(workspace)
+            answers = Answers(workspace, stage.commit)
             space = Space(workspace)
             camera = CameraPanel(workspace)
             preview = Preview(workspace)

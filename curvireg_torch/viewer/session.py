@@ -467,23 +467,8 @@ class Session:
         return found.registration, found.document, photographs, boxes
 
     def document(self) -> Fields:
-        """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done
-        by hand."""
-        result = self.shot.require_result()
-        document = dict(result.document)
-        registration = result.chosen
-        answer = result.answer
-        if registration is not result.registration:
-            document |= registration.to_dict()
-            if registration.views:
-                rows = zip(result.document["photographs"], document["photographs"], strict=True)
-                document["photographs"] = [{**row, **moved} for row, moved in rows]
-            if "detection" in document:
-                first, *others = document["detection"]["instances"]
-                first = {**first, "confidence": registration.confidence, **answer.pose.pose_dict()}
-                document["detection"] = {**document["detection"], "instances": [first, *others]}
-        by_hand = {"hypothesis": answer.number, "by_hand": list(answer.edits)}
-        return {**document, "viewer": {**document["viewer"], **by_hand}}
+        """:meth:`.Shot.document` of the photograph that is shown."""
+        return self.shot.document()
 
     def python(self) -> str:
         """A Python program that gives the answer."""

@@ -20,6 +20,7 @@ from ..jobs.options import RegisterOptions
 from ..jobs.result_files import RegisteredViews
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..registration.photograph import Photograph
+from ..utils.aliases import Fields
 from ..utils.likes import BoxLike
 from ..visualization import contour_overlay, pose_glb
 from ..visualization.encoding import png
@@ -216,6 +217,29 @@ class Shot:
             raise InvalidInputError("there is no result yet; register first")
         return self.result
 
+    def snapshot(self) -> "Shot":
+        """A copy with the present answer, whatever is chosen or found meanwhile."""
+        return replace(self, result=None if self.result is None else replace(self.result))
+
+    def document(self) -> Fields:
+        """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done
+        by hand."""
+        result = self.require_result()
+        document = dict(result.document)
+        registration = result.chosen
+        answer = result.answer
+        if registration is not result.registration:
+            document |= registration.to_dict()
+            if registration.views:
+                rows = zip(result.document["photographs"], document["photographs"], strict=True)
+                document["photographs"] = [{**row, **moved} for row, moved in rows]
+            if "detection" in document:
+                first, *others = document["detection"]["instances"]
+                first = {**first, "confidence": registration.confidence, **answer.pose.pose_dict()}
+                document["detection"] = {**document["detection"], "instances": [first, *others]}
+        by_hand = {"hypothesis": answer.number, "by_hand": list(answer.edits)}
+        return {**document, "viewer": {**document["viewer"], **by_hand}}
+
     def choose(self, number: int) -> None:
         """Make a hypothesis the answer, by its number from 0."""
         result = self.require_result()
@@ -254,14 +278,18 @@ class Shot:
         result.answer = Answer(pose, answer.number, (*answer.edits, edit))
 
     def fit(self) -> None:
-        """Fit the contours at the answer to the photograph's edges."""
-        registrar = self.require_result().registrar
-        T, K = self.projection
+        """Fit the contours at the answer to the photograph's edges, unless another one is chosen or
+        found meanwhile."""
+        result = self.require_result()
+        answer = result.answer
+        registrar = result.registrar
+        T, K = self.projection_of(answer.pose)
         contours = registrar.describer.contours
         margin = registrar.bank.settings.margin
         fit = fit_contours(contours, self.image, self.require_box(), K, T[None], margin=margin)
         supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
-        self.place(fit.transform[0], f"contours fitted, edge support {supports}")
+        if self.answer is answer:
+            self.place(fit.transform[0], f"contours fitted, edge support {supports}")
 
     def require_box(self) -> Tensor:
         """The box in which the object was registered; :class:`InvalidInputError` without one."""

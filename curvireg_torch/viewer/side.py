@@ -41,6 +41,7 @@ from .widgets import (
     show_value,
     text,
 )
+from .workspace import Workspace
 
 DOWNLOADS = {
     "picture": ("overlay.png", "image/png"),
@@ -96,7 +97,14 @@ CHOICES = {
 
 class Answers(Panel):
     """The chosen answer with its verdict and its downloads, and a card of each answer that can be
-    chosen."""
+    chosen.
+
+    ``commit`` makes a pose that is being moved the answer.
+    """
+
+    def __init__(self, workspace: Workspace, commit: Callable[[], None]) -> None:
+        self.commit = commit
+        super().__init__(workspace)
 
     def lay_out(self) -> None:
         with region(
@@ -134,10 +142,11 @@ class Answers(Panel):
             self.facts = text("p", "", "lines", data_testid="facts")
 
     async def _download(self, kind: str) -> None:
+        self.commit()
         name, media_type = DOWNLOADS[kind]
-        session = self.session
-        document = {"result.json": lambda: to_json(session.document()).encode()}
-        make = {"picture": session.shot.overlay, "pose.glb": session.shot.glb, **document}[kind]
+        shot = self.session.shot.snapshot()  # another may be shown before it is the turn of this
+        document = {"result.json": lambda: to_json(shot.document()).encode()}
+        make = {"picture": shot.overlay, "pose.glb": shot.glb, **document}[kind]
         if content := await self.workspace.run("pose", make):
             ui.download.from_url(f"./{self.workspace.serve(name, content, media_type)}", name)
 
@@ -151,6 +160,8 @@ class Answers(Panel):
             self._describe()
         if (self.changed("result", shot.result) or new_shot) and shot.result is not None:
             await self._draw_cards(shot)
+        for repair in self.repairs.default_slot.children:
+            set_enabled(repair, not self.workspace.searching)
         for number, card in enumerate(self.cards.default_slot.children):
             set_pressed(card, answer and number == answer.number)
 
@@ -220,8 +231,9 @@ class Answers(Panel):
 
         def search_after(change: Callable[[], object]) -> Callable[[], None]:
             def repair() -> None:
-                change()
-                self.workspace.start_search()
+                if session.shot is shot and not self.workspace.searching:
+                    change()
+                    self.workspace.start_search()
 
             return repair
 
@@ -511,7 +523,7 @@ class Space(Panel):
         self.show.set_visibility(self.drawn is None)
 
     async def _draw(self) -> None:
-        shot = self.session.shot
+        shot = self.session.shot.snapshot()
         content = await self.workspace.run("pose", shot.glb)
         if not content:
             return

@@ -17,7 +17,7 @@ from ..rendering import shade
 from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink, to_uint8
 from ..visualization.overlay import LEGEND
-from .shot import Numbers, Point, Shot, dragged_box
+from .shot import Answer, Numbers, Point, Shot, dragged_box
 from .widgets import (
     Panel,
     button,
@@ -65,6 +65,7 @@ class Stage(Panel):
         self.pressed: tuple[Any, Point, bool] | None = None
         self.drawn: Numbers | None = None  # the box, as it is dragged
         self.moved: Tensor | None = None  # the pose that is being moved by hand
+        self.held: Answer | None = None  # the answer that is
         self._last_gesture = 0.0
         self._following = False
         with region("section", "stage", aria_label="photograph", data_testid="stage"):
@@ -133,19 +134,19 @@ class Stage(Panel):
             text("p", LEGEND, "facts")
 
     def _set_mode(self, mode: str) -> None:
-        self._commit()
+        self.commit()
         self.mode = mode
 
     def _undo(self) -> None:
         shot = self.session.shot
         if self.mode == "pose":
-            self._commit()
+            self.commit()
             shot.undo()
         else:
             shot.set_box(shot.box_before)
 
     async def _fit(self) -> None:
-        self._commit()
+        self.commit()
         await self.workspace.run("pose", self.session.shot.fit)
 
     async def _handle(self, event: Any) -> None:
@@ -189,6 +190,8 @@ class Stage(Panel):
         result = self.session.shot.require_result()
         T, K = self.session.shot.projection
         kind = what["type"]
+        if self.pressed is None and self.moved is None:
+            self.held = self.session.shot.answer
         T = T if self.moved is None else self.moved
         self._last_gesture = time.monotonic()
         try:
@@ -198,7 +201,7 @@ class Stage(Panel):
                 T, start, turns = self.pressed
                 self.moved = result.dragged(T, K, start, point, turns=turns)
             elif kind == "release":
-                self._commit()
+                self.commit()
             elif kind == "cancel":
                 self._end_gesture()
             elif kind == "scale":  # wheel and pinch
@@ -246,12 +249,13 @@ class Stage(Panel):
         finally:
             self._following = False
 
-    def _commit(self) -> None:
-        """Make the pose that was moved the answer."""
+    def commit(self) -> None:
+        """Make the pose that was moved the answer, unless that is another one by now."""
         shot = self.session.shot
         moved = self.moved
         self._end_gesture()
-        if moved is None or shot.answer is None or shot.photo is not self.shown.get("photo"):
+        is_shown = shot.photo is self.shown.get("photo") and shot.answer is self.held
+        if moved is None or not is_shown:
             return
         if not moved.equal(shot.projection[0]):
             shot.place(moved)
@@ -285,7 +289,7 @@ class Stage(Panel):
             and self.moved is not None
             and time.monotonic() - self._last_gesture > COMMIT_SECONDS
         ):
-            self._commit()
+            self.commit()
         self._show_mode()
         if self.changed("answer", shot.answer):
             self.pressed = self.moved = None
@@ -327,10 +331,9 @@ class Stage(Panel):
             mark(thumbnail, "done", shot.answer)
 
     def _select(self, shot: Shot) -> None:
-        self._commit()
+        self.commit()
         if shot in self.session.shots:  # not closed in another window
             self.session.shot = shot
-        self.workspace.messages.pop("pose", None)
 
     def _show_mode(self) -> None:
         is_pose = self.mode == "pose"

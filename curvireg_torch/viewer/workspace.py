@@ -81,7 +81,7 @@ class Workspace:
         self.asks_for_unit = False
         self.refused_mesh: Path | None = None  # it may lack parts that come after it
         self._warnings: dict[str, str] = {}  # about what is open; they outlive an error
-        self._failed_inputs: Any = None  # of the search whose error is shown
+        self._pose_inputs: Any = None  # of the job whose message ``pose_message`` tells
         self.files: dict[str, tuple[bytes, str]] = {}
         self.receiving = dict[Path, tuple[str, int]]()
         self.started = 0.0
@@ -122,14 +122,14 @@ class Workspace:
                 self.messages[part] = warning
 
     def pose_message(self) -> str:
-        """The error of the last search, until its inputs change."""
-        if self._failed_inputs != self.session.inputs():
-            self.messages.pop("pose", None)
-        return self.messages.get("pose", "")
+        """What the last search, or job of its answer, has to say, where the inputs are its own."""
+        is_of_these = self._pose_inputs == self.session.inputs()
+        return self.messages.get("pose", "") if is_of_these else ""
 
     async def _attempt(self, part: str, job: Callable[[], Any]) -> Any:
         caught: list[Any] = []
         _caught.set(caught)
+        inputs = self.session.inputs()
         try:
             result = await asyncio.to_thread(job)
             if part in ("photograph", "mesh", "rig"):  # what the search said is outdated
@@ -143,6 +143,9 @@ class Workspace:
         except Exception as error:  # a defect must not end the page; the terminal has the traceback
             traceback.print_exc()
             self._show(part, f"{type(error).__name__}: {error}; see the terminal")
+        finally:
+            if part == "pose":
+                self._pose_inputs = inputs
         return None
 
     def _keep_warnings(self, part: str, caught: Sequence[Any]) -> None:
@@ -181,7 +184,6 @@ class Workspace:
                 self._begun = True
             self.forget_errors("pose")
             await self._attempt("pose", self.session.register)
-            self._failed_inputs = self.session.inputs()
         finally:
             self._search = None
 

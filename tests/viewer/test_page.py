@@ -1,4 +1,5 @@
 import asyncio
+import json
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ from curvireg_torch.geometry import Camera
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.viewer.page import Steps, build_page
 from curvireg_torch.viewer.shot import Shot
-from curvireg_torch.viewer.side import Answers, CameraPanel, Inputs, Preview
+from curvireg_torch.viewer.side import Answers, CameraPanel, Inputs, Preview, Space
 from curvireg_torch.viewer.stage import Stage
 from curvireg_torch.viewer.workspace import Workspace
 from tests.viewer.test_session import write_scene
@@ -214,7 +215,7 @@ def test_each_remark_has_its_repair(shown, monkeypatch):
     session = shown.session
     started = []
     shot = session.shot
-    answers = Answers(shown)
+    answers = Answers(shown, Mock())
     monkeypatch.setattr(
         shown, "start_search", lambda: started.append((shot.box, session.options.camera))
     )
@@ -230,6 +231,11 @@ def test_each_remark_has_its_repair(shown, monkeypatch):
     session.set_limits(elevation=(0.0, 10.0))
     repairs = answers._repairs(hint)
     assert list(repairs) == ["Search without the prior", "Search with that box"]
+    with monkeypatch.context() as patch:  # a search in another photograph
+        patch.setattr(Workspace, "searching", True)
+        for repair in repairs.values():
+            repair()
+    assert (started, shot.box) == ([], before)
     for repair in repairs.values():
         repair()
     assert session.options.limits == {}
@@ -276,6 +282,40 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
     assert "class='handle line'" in posed.shapes.content
 
 
+def test_what_is_saved_and_drawn_is_the_answer_at_the_click(shown, monkeypatch):
+    shot = shown.session.shot
+    stage = Stage(shown)
+    answers = Answers(shown, stage.commit)
+    space = Space(shown)
+    monkeypatch.setattr(ui.download, "from_url", Mock())
+    asyncio.run(stage.refresh())
+    send(stage, "scale", factor=1.1, roll=5.0)
+
+    async def click():
+        async with shown._lock:  # a photograph opens
+            saving = asyncio.gather(answers._download("result.json"), space._draw())
+            await asyncio.sleep(0)
+            clicked = shot.answer
+            shown.session.open_photo(shot.path)
+            shot.choose(1)
+        await saving
+        return clicked
+
+    assert space.drawn is None
+    clicked = asyncio.run(click())
+    assert space.drawn is clicked
+    viewer = json.loads(shown.files["result.json"][0])["viewer"]
+    assert (viewer["hypothesis"], viewer["by_hand"]) == (0, list(clicked.edits))
+    assert len(clicked.edits) == 1, "the wheel was at rest for less than a moment"
+    shown.session.shot = shot
+    asyncio.run(stage.refresh())
+    send(stage, "scale", factor=1.1, roll=5.0)
+    shot.choose(0)
+    stage._last_gesture -= 10
+    asyncio.run(stage.refresh())
+    assert shot.answer.edits == (), "what was moved was another answer"
+
+
 def test_photographs_are_chosen_from_a_strip(shown, registered):
     session = shown.session
     stage = Stage(shown)
@@ -297,7 +337,7 @@ def test_photographs_are_chosen_from_a_strip(shown, registered):
     send(stage, "scale", factor=1.1, roll=5.0)
     session.shot = second  # in another window, and this one has not noticed yet
     drag(stage, (40, 50), (100, 80))
-    stage._commit()
+    stage.commit()
     assert second.box == pytest.approx((20, 30, 120, 90))
     assert (second.answer, first.answer.pose.projection[0].equal(T)) == (None, True)
     stage.mode = "box"

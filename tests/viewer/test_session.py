@@ -21,9 +21,11 @@ from curvireg_torch.geometry import Camera, rotation_error, rotation_from_viewpo
 from curvireg_torch.jobs.options import WITHIN, RegisterOptions
 from curvireg_torch.jobs.store import to_json
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
+from curvireg_torch.registration import fit_contours
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import programs
 from curvireg_torch.viewer import session as module
+from curvireg_torch.viewer import shot as shot_module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.shot import dragged_box
 from tests._support import double, refused, scene, write_photo
@@ -173,6 +175,18 @@ def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
     assert (shot.answer.edits, shot.result.answer_before) == ((), None)
     with refused("touch the camera"):
         shot.result.moved(moved, translation=(0, 0, -100))
+
+
+def test_a_fit_belongs_to_the_answer_that_it_began_from(session, monkeypatch):
+    shot = session.shot
+
+    def fit(*given, **how):
+        shot.choose(1)
+        return fit_contours(*given, **how)
+
+    monkeypatch.setattr(shot_module, "fit_contours", fit)
+    shot.fit()
+    assert (shot.answer.number, shot.answer.edits) == (1, ())
 
 
 def test_the_python_program_gives_the_same_numbers(session, registered):

@@ -183,16 +183,23 @@ async def started(workspace):
     await workspace.start_search()
 
 
-def test_the_error_of_a_search_goes_when_its_inputs_change(workspace, scene, monkeypatch):
-    send(workspace, scene / "photo.png")
-    monkeypatch.setattr(
-        workspace.session, "register", Mock(side_effect=InvalidInputError("box: too small"))
-    )
+def test_the_error_of_a_search_stands_where_its_inputs_are(workspace, scene, monkeypatch):
+    session = workspace.session
 
+    def register():
+        session.shot = first  # in another window
+        raise InvalidInputError("box: too small")
+
+    send(workspace, scene / "photo.png")
+    send(workspace, scene / "photo.png")
+    first, second = session.shots
+    monkeypatch.setattr(session, "register", register)
     asyncio.run(started(workspace))
+    assert workspace.pose_message() == ""
+    session.shot = second
     assert workspace.pose_message() == "box: too small"
-    workspace.session.shot.set_box((1.0, 2.0, 90.0, 80.0))
-    assert (workspace.pose_message(), workspace.messages) == ("", {})
+    second.set_box((1.0, 2.0, 90.0, 80.0))
+    assert workspace.pose_message() == ""
 
 
 def test_what_a_mesh_names_is_part_of_it_and_no_photograph(workspace, scene):
