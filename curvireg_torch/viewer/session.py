@@ -154,6 +154,7 @@ class Session:
         self.removed = number, shot
         if shot is self.shot:
             self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
+        self._match_rig()  # another one of its name may be open
 
     def _opened(
         self,
@@ -185,10 +186,11 @@ class Session:
 
     def _open_again(self, shot: Shot, view: Entry | None, camera: GivenCamera) -> Shot:
         """A photograph with another camera, or row of a rig. Its box stays unless distortion is
-        removed, or no longer is; its result only where no rig is concerned."""
+        removed, or no longer is, or another one; its result only where no rig is concerned."""
         photo = None if shot.is_undistorted else shot.photo
         opened = self._opened(shot.path, None, view, camera, photo)
-        if opened.is_undistorted or shot.is_undistorted:
+        is_same = torch.equal(opened.image, shot.image)
+        if opened.is_undistorted != shot.is_undistorted or not is_same:
             return opened
         if view is not None or shot.view is not None:
             return replace(opened, box=shot.box or opened.box, box_before=shot.box_before)
@@ -240,9 +242,8 @@ class Session:
         shots: list[Shot] = []
         for shot in self.shots:
             view = self._row_of(shot.path, shots)
-            is_concerned = view is not None or shot.view is not None
             shots.append(
-                self._open_again(shot, view, self.options.camera) if is_concerned else shot
+                shot if view is shot.view else self._open_again(shot, view, self.options.camera)
             )
         self._replace_shots(shots)
 
@@ -283,8 +284,8 @@ class Session:
     def set_camera(self, camera: GivenCamera = None) -> None:
         """Change the camera of all photographs that have none in a rig.
 
-        Boxes and results stay unless distortion is removed, or no longer is; after an error nothing
-        has changed.
+        Boxes and results stay unless distortion is removed, or no longer is, or another one; after
+        an error nothing has changed.
         """
         try:
             check_camera(camera)

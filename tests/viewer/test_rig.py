@@ -294,3 +294,13 @@ def test_of_two_photographs_of_one_name_the_first_has_the_row_of_the_rig():
     assert Session._row_of(session, Path("c/0.PNG"), shots) is None
     shots[0].view = None
     assert Session._row_of(session, Path("c/0.PNG"), shots) is row
+
+
+def test_the_second_photograph_of_a_name_gets_the_row_once_the_first_is_removed(workspace, rig):
+    session = send(workspace, rig[0], "rig.csv", "0.png", "1.png", "0.png")
+    first, other, second = session.shots
+    assert (second.view, session.shot) == (None, second)
+    session.shot = first
+    asyncio.run(workspace.remove_photo())
+    assert session.shots[0] is session.shot is other, "with its result"
+    assert [shot.view for shot in session.together()] == [first.view, other.view]

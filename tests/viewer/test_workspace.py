@@ -24,6 +24,7 @@ import trimesh
 from PIL import Image
 
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError, OutputError
+from curvireg_torch.geometry import Camera
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.viewer import workspace as module
 from curvireg_torch.viewer.parts import place_part
@@ -159,15 +160,19 @@ def test_a_mesh_of_a_doubtful_size_asks_for_its_unit_until_another_is_open(works
     assert (workspace.messages, workspace.asks_for_unit) == ({}, False)
 
 
-def test_a_removed_photograph_can_be_brought_back(workspace, scene, monkeypatch):
+@pytest.mark.parametrize("distortion", [(), (0.1, 0.0, 0.0, 0.0)])
+def test_a_removed_photograph_can_be_brought_back(workspace, scene, monkeypatch, distortion):
     session = workspace.session
+    session.set_camera(Camera([[300.0, 0, 119.5], [0, 300, 89.5], [0, 0, 1]], distortion))
     for name in ("a.png", "b.png"):
         send(workspace, scene / "photo.png", name)
     session.shot = session.shots[0]
     session.shot.set_box((1.0, 2.0, 30.0, 40.0))
+    session.shot.result = result = Mock()
     asyncio.run(workspace.remove_photo())
     assert names(workspace) == ["b.png"]
     asyncio.run(workspace.restore_photo())
+    assert session.shot.result is result
     assert (names(workspace), session.shot.path.name) == (["a.png", "b.png"], "a.png")
     assert (session.shot.box, session.removed) == ((1.0, 2.0, 30.0, 40.0), None)
     asyncio.run(workspace.restore_photo())
