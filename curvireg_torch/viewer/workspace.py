@@ -275,7 +275,7 @@ class Workspace:
             )
         elif suffix == ".csv" or path.name in ("images.txt", "scene_camera.json"):
             if path.name == "scene_camera.json" and session.options.unit in (None, "m"):
-                await self.set_option("unit", "mm")  # of BOP sets
+                await self.set_option("unit", "mm", is_given=False)  # of BOP sets
             await self.open_rig(path.parent if path.name == "scene_camera.json" else path)
         elif (
             (rig := session.rig_path) is not None
@@ -357,9 +357,13 @@ class Workspace:
         """Open the photograph again that was removed last."""
         await self.run("photograph", self.session.restore_photo)
 
-    async def set_option(self, name: str, value: Any) -> None:
-        """Change an option; the mesh is opened again if it depends on it."""
-        self.session.options = replace(self.session.options, **{name: value})
+    async def set_option(self, name: str, value: Any, *, is_given: bool = True) -> None:
+        """Change an option; the mesh is opened again if it depends on it. A unit ``is_given`` by
+        the user, who means banks too, or follows from other files."""
+        changes = {name: value}
+        if name == "unit":
+            changes["unit_is_given"] = is_given
+        self.session.options = replace(self.session.options, **changes)
         if name in ("unit", "up") and self.session.mesh_path is not None:
             await self.open_mesh(self.session.mesh_path)
 

@@ -276,6 +276,7 @@ def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
     )
     send(workspace, tmp_path, *names)
     assert (workspace.messages, session.options.unit) == ({}, "mm")
+    assert not session.options.unit_is_given
     assert [shot.path.name for shot in session.together()] == ["000000.png"]
     assert session.shot.box == (5.0, 6.0, 25.0, 36.0)
     send(workspace, tmp_path, "000001.png", "000002.png")
