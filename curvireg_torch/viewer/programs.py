@@ -41,7 +41,9 @@ def python_program(shot: Shot, name: Callable[[Path], str]) -> str:
         )
         photos = list(map(read.format, photos))
     of_mesh = _given(unit=request.unit, up=request.up)
-    of_registrar = _given(mesh_is=request.mesh_is)
+    chosen = {name: getattr(request, name) for name in ("renderer", "device")}
+    chosen = {name: value for name, value in chosen.items() if value != _DEFAULTS[name]}
+    of_registrar = _given(mesh_is=request.mesh_is, **chosen)
     if pipeline := _pipeline(request):
         of_registrar = f", pipeline={pipeline}{of_registrar}"
     of_parts = _given(
@@ -101,12 +103,12 @@ def _pipeline(request: RegisterOptions) -> str:
 
 def command_line(options: RegisterOptions, name: Callable[[Path], str], rig: str = "") -> str:
     """``curvireg register`` with these options; ``name`` tells what the user calls a file."""
-    words = [
-        "curvireg",
-        "register",
-        *(["--views", rig] if rig else list(map(name, options.photos)) or ["PHOTO"]),
-    ]
-    words += list(map(name, options.meshes)) or ["MESH"]
+    photos, meshes = (
+        [_no_option(name(path)) for path in paths] for paths in (options.photos, options.meshes)
+    )
+    words = ["curvireg", "register"]
+    words += ["--views", _no_option(rig)] if rig else photos or ["PHOTO"]
+    words += meshes or ["MESH"]
     limits = options.limits if options.limits.keys() - QUALIFIERS else {}
     values: dict[str, Any] = {
         "box": options.box,
@@ -126,3 +128,8 @@ def command_line(options: RegisterOptions, name: Callable[[Path], str], rig: str
             is_like_option = texts[0][0] == "-" and isinstance(value, str)
             words += [f"--{option}={value}"] if is_like_option else [f"--{option}", *texts]
     return shlex.join([*words, "--out", "result"])
+
+
+def _no_option(name: str) -> str:
+    """A file name that no command takes for an option."""
+    return f"./{name}" if name.startswith("-") else name

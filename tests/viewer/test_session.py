@@ -204,6 +204,10 @@ def test_the_python_program_gives_the_same_numbers(session, registered):
     assert torch.allclose(found["translation"], shot.answer.pose.translation, rtol=1e-3)
     shot.place(shot.result.moved(shot.answer.pose.projection[0], rotation=(0, 6, 0)))
     assert f"'rotation': {shot.answer.pose.rotation.tolist()}" in session.python()
+    request, boxes = shot.result.inputs
+    elsewhere = replace(request, renderer="embree", device="cuda")
+    shot.result = replace(shot.result, inputs=(elsewhere, boxes))
+    assert ", renderer='embree', device='cuda')" in session.python()
 
 
 def test_the_python_program_says_what_boxes_are():
@@ -385,6 +389,13 @@ def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
     assert again.limits["viewpoint"] == (10.0, -20.5, 0.0)
     session.set_limits(**{**dict.fromkeys(session.options.limits), "front": "y"})
     assert "--front" not in session.command(), "it limits nothing by itself"
+
+
+def test_names_of_files_are_no_options():
+    options = RegisterOptions(photos=(Path("-p.png"),), meshes=(Path("--t.ply"),))
+    for rig, first in (("", "./-p.png"), ("-rig.csv", "--views ./-rig.csv")):
+        command = programs.command_line(options, str, rig)
+        assert command == f"curvireg register {first} ./--t.ply --out result"
 
 
 @pytest.mark.usefixtures("folder")
