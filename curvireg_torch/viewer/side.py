@@ -421,15 +421,14 @@ class Preview(Panel):
         with fold("The model", "model", is_open=True) as self.section:
             self.place = region("div", "preview", data_testid="preview")
             with region("div", "row"):
-                button("It looks like this", self._hint, "looks-like-this")
+                self.of_scene = [
+                    self.place,
+                    button("It looks like this", self._hint, "looks-like-this"),
+                ]
                 self.no_prior = button("No prior", self.session.remove_limits, "no-prior", "quiet")
                 for name, label in (("up", "Mark what is up"), ("front", "Mark the front")):
-                    button(
-                        label,
-                        lambda name=name: setattr(self, "mark", name),
-                        f"mark-{name}",
-                        "quiet",
-                    )
+                    marking = partial(setattr, self, "mark", name)
+                    self.of_scene.append(button(label, marking, f"mark-{name}", "quiet"))
             self.facts = fact_line("prior-facts")
 
     async def _hint(self) -> None:
@@ -458,7 +457,13 @@ class Preview(Panel):
         self.section.set_visibility(mesh is not None)
         limiting = limits.keys() - {"front"}
         self.no_prior.set_visibility(bool(limiting))
+        is_drawn = mesh is not None and len(mesh.faces) <= MAX_VIEWER_FACES
+        for element in self.of_scene:
+            element.set_visibility(is_drawn)
         words = "Turn it with the mouse until it looks as in the photograph: that helps the search."
+        if not is_drawn:
+            self.mark = ""
+            words = f"Meshes of more than {MAX_VIEWER_FACES:,} faces are not drawn."
         if "viewpoint" in limits:
             at = "azimuth {:g}, elevation {:g}".format(*limits["viewpoint"])
             words = f"Pose prior: seen from {at}, within {limits['within']:g} degrees."
@@ -470,7 +475,7 @@ class Preview(Panel):
             return
         self.scene = None
         self.place.clear()
-        if mesh is None or len(mesh.faces) > MAX_VIEWER_FACES:
+        if not is_drawn:
             return
         if content := await self.workspace.run("page", self.session.preview):
             self._draw(self.workspace.serve("model.glb", content, "model/gltf-binary"))

@@ -16,6 +16,7 @@ from nicegui.page import page
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import Camera
 from curvireg_torch.jobs.options import RegisterOptions
+from curvireg_torch.viewer import side
 from curvireg_torch.viewer.page import Steps, build_page
 from curvireg_torch.viewer.shot import Shot
 from curvireg_torch.viewer.side import Answers, CameraPanel, Inputs, Preview, Space
@@ -200,6 +201,18 @@ def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(worksp
     assert click("up", 0, 0, -1.0) == ("-y", None)
     assert session.mesh.up == "-y"
     assert click("front", 0, 0, 1.0) == ("-y", None), "what is up is not the front"
+
+
+def test_a_mesh_that_is_not_drawn_is_said_and_has_no_buttons(workspace, build, monkeypatch):
+    monkeypatch.setattr(side, "MAX_VIEWER_FACES", 967)
+    preview = build(Preview)
+    asyncio.run(workspace.open_mesh(workspace.folder / "truck.ply"))
+    asyncio.run(preview.refresh())
+    assert not any(element.visible for element in preview.of_scene)
+    assert preview.no_prior.visible
+    workspace.session.remove_limits()
+    asyncio.run(preview.refresh())
+    assert preview.facts.content == "Meshes of more than 967 faces are not drawn."
 
 
 @pytest.fixture
