@@ -144,7 +144,7 @@ class Answers(Panel):
     async def _download(self, kind: str) -> None:
         self.commit()
         name, media_type = DOWNLOADS[kind]
-        shot = self.session.shot.snapshot()  # another may be shown before it is the turn of this
+        shot = self.session.shot.snapshot()  # others may be shown before the job runs
         document = {"result.json": lambda: to_json(shot.document()).encode()}
         make = {"picture": shot.overlay, "pose.glb": shot.glb, **document}[kind]
         if content := await self.workspace.run("pose", make):

@@ -65,7 +65,7 @@ class Stage(Panel):
         self.pressed: tuple[Any, Point, bool] | None = None
         self.drawn: Numbers | None = None  # the box, as it is dragged
         self.moved: Tensor | None = None  # the pose that is being moved by hand
-        self.held: Answer | None = None  # the answer that is
+        self.held: Answer | None = None  # the answer from which it is moved
         self._last_gesture = 0.0
         self._following = False
         with region("section", "stage", aria_label="photograph", data_testid="stage"):

@@ -158,7 +158,7 @@ def test_a_mesh_of_a_doubtful_size_asks_for_its_unit_until_another_is_open(works
     assert workspace.asks_for_unit
     asyncio.run(workspace.set_option("unit", "mm"))
     assert (workspace.messages, workspace.asks_for_unit) == ({}, False)
-    assert workspace.session.options.unit_is_given, "banks have another one, or are refused"
+    assert workspace.session.options.unit_is_given, "for banks, too"
 
 
 @pytest.mark.parametrize("distortion", [(), (0.1, 0.0, 0.0, 0.0)])
