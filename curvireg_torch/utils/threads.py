@@ -90,10 +90,12 @@ def map_on_threads(
             return [job(item) for item in items]
     threads_each = max(1, threads // max(1, len(items)))
     with_gradients = torch.is_grad_enabled()
+    for_inference = torch.is_inference_mode_enabled()
 
     def run(item: Item) -> Result:
         _this_thread.threads = threads_each
-        with torch.set_grad_enabled(with_gradients):  # threads do not inherit it
+        # threads do not inherit them
+        with torch.inference_mode(for_inference), torch.set_grad_enabled(with_gradients):
             return job(item)
 
     with single_threaded_pool() as pool:

@@ -137,12 +137,17 @@ def test_submitted_jobs_are_cancelled_after_an_error_of_the_caller():
     assert len(done) < 100
 
 
-@pytest.mark.parametrize("gradients", [True, False])
-def test_jobs_record_gradients_as_their_caller_does(gradients):
-    with torch.set_grad_enabled(gradients):
-        assert (
-            threads.map_on_threads(lambda _: torch.is_grad_enabled(), range(3)) == [gradients] * 3
-        )
+@pytest.mark.parametrize("mode", [torch.enable_grad, torch.no_grad, torch.inference_mode])
+def test_jobs_record_gradients_as_their_caller_does(mode):
+    with mode():
+        changed = torch.zeros(3)
+        modes = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+        def job(item):
+            changed[item] = 1.0  # of inference: in inference mode only
+            return torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+        assert threads.map_on_threads(job, range(3)) == [modes] * 3
 
 
 def test_jobs_share_few_threads_on_many_cores():
