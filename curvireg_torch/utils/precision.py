@@ -23,9 +23,17 @@ def full_precision() -> Iterator[None]:
 @contextmanager
 def exact_convolutions() -> Iterator[None]:
     """Within, GPUs compute convolutions in float32, not in TF32, whose 10 bits move poses."""
-    before = torch.backends.cudnn.allow_tf32
-    torch.backends.cudnn.allow_tf32 = False
+    # From torch 2.9 on, the flag cannot be read after precision was chosen in the new way.
+    holder = getattr(torch.backends.cudnn, "conv", torch.backends.cudnn)
+    is_new = holder is not torch.backends.cudnn
+    name, tf32, exact = (
+        ("fp32_precision", "tf32", "ieee") if is_new else ("allow_tf32", True, False)
+    )
+    if getattr(holder, name) != tf32:
+        yield  # a value that is set back would no longer follow torch.backends.fp32_precision
+        return
+    setattr(holder, name, exact)
     try:
         yield
     finally:
-        torch.backends.cudnn.allow_tf32 = before
+        setattr(holder, name, tf32)
