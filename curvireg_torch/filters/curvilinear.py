@@ -59,10 +59,10 @@ def apply_to_depth(
     checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
     seen = ops.at_least_float32(depth)
     if mask is not None:
-        fits = mask.ndim <= 4 and all(
-            m in (1, n) for m, n in zip(mask.shape[::-1], depth.shape[::-1], strict=False)
-        )
-        if not fits or mask.dtype != torch.bool:
+        is_mask = isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.ndim <= 4
+        if not is_mask or any(
+            m not in (1, n) for m, n in zip(mask.shape[::-1], depth.shape[::-1], strict=False)
+        ):
             raise InvalidInputError(
                 f"mask: expected bool of shape {tuple(depth.shape)}, got {type_and_shape(mask)}"
             )
@@ -208,7 +208,7 @@ def image_gradient(image: Tensor, *, sigma: float | Tensor = 1.0) -> Tensor:
     """
     checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
     return ops.apply_to_photograph(
-        lambda x: ops.central_gradient(ops.smooth(x, checked_sigma)), image
+        lambda x, _: ops.central_gradient(ops.smooth(x, checked_sigma)), image
     )
 
 
@@ -229,7 +229,7 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
     """
     checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
 
-    def layer(x: Tensor) -> ops.Planes:
+    def layer(x: Tensor, _: Tensor | None) -> ops.Planes:
         gx, gy = ops.central_gradient(ops.smooth(x, checked_sigma))
         length = ops.safe_sqrt(ops.squared_length(gx, gy))
         return gx * length, gy * length
@@ -263,7 +263,7 @@ def principal_curvature_image(
     """
     scales = ops.check_sigmas(sigmas, "sigmas")
 
-    def layer(image: Tensor) -> ops.Planes:
+    def layer(image: Tensor, _: Tensor | None) -> ops.Planes:
         best = vx = vy = torch.zeros_like(image)
         for sigma in scales:
             xx, yy, xy = (

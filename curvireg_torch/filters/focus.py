@@ -60,19 +60,25 @@ def edge_blur(
     check_option(mode, MODES, "mode")
     sigmas = ops.check_sigmas(reblur_sigmas, "reblur_sigmas")
 
-    def layer(x: Tensor) -> ops.Planes:
+    def layer(x: Tensor, missing: Tensor | None) -> ops.Planes:
         gx, gy = ops.central_gradient(ops.smooth(x, 0.0))
-        return tuple(_edge_blur(x, gx, gy, sigmas, mode))
+        return tuple(_edge_blur(x, gx, gy, sigmas, mode, missing))
 
     return ops.apply_to_photograph(layer, image, missing_value=MAX_BLUR)
 
 
 def _edge_blur(
-    x: Tensor, gx: Tensor, gy: Tensor, reblur_sigmas: Sequence[float], mode: str
+    x: Tensor,
+    gx: Tensor,
+    gy: Tensor,
+    reblur_sigmas: Sequence[float],
+    mode: str,
+    missing: Tensor | None,
 ) -> list[Tensor]:
     """Blur of the edge through each pixel of ``x``, whose gradient is (gx, gy), for each
     re-blurring."""
-    saliency = ops.squared_length(gx, gy)
+    x = ops.replicate_box(x, missing)
+    saliency = ops.replicate_box(ops.squared_length(gx, gy), missing)
     # 1 and 0 instead of tiny numbers, whose quotients have no finite second derivative
     flat = saliency <= ops.safe_eps(saliency)
     variance, fourth = _difference_moments(gx, torch.where(flat, 1.0, saliency))
@@ -157,14 +163,16 @@ def multiscale_focus_curves(
     if least >= 1.0:
         raise InvalidInputError(f"threshold: expected 0 <= threshold < 1, got {least}")
 
-    def layer(image: Tensor) -> ops.Planes:
+    def layer(image: Tensor, missing: Tensor | None) -> ops.Planes:
         x = ops.smooth(image, checked_sigma)
         gx, gy = ops.central_gradient(x)
         saliency = ops.squared_length(gx, gy)
-        blurs = _edge_blur(x[..., 1:-1, 1:-1], gx, gy, [float(i) for i in range(1, scales)], mode)
+        reblur_sigmas = [float(i) for i in range(1, scales)]
+        blurs = _edge_blur(x[..., 1:-1, 1:-1], gx, gy, reblur_sigmas, mode, missing)
         blur = functools.reduce(torch.maximum, blurs)
         focus = blur.clamp(min=MIN_BLUR).reciprocal()
-        retained = (focus > math.exp(-scales)) & (saliency > least * ops.image_maximum(saliency))
+        limit = least * ops.image_maximum(saliency, missing)
+        retained = (focus > math.exp(-scales)) & (saliency > limit)
         weight = saliency.clamp(min=ops.safe_eps(saliency)) ** power
         return scaled_direction(focus * weight * retained, gx, gy)
 

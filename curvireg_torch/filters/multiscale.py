@@ -4,6 +4,7 @@ space."""
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import InvalidInputError
@@ -64,9 +65,10 @@ def anisotropic_diffusion(
         raise InvalidInputError(f"step: expected 0 < step <= 0.25 (stability), got {step}")
 
     def layer(x: Tensor) -> ops.Planes:
-        filled = ops.fill_missing(x)
+        missing = ops.missing_mask(x) if ops.may_have_missing(x) else None
+        filled = x if missing is None else ops.fill_missing(x, missing)
         _warn_of_unit(filled, kappa)
-        return (diffuse(filled, iterations, kappa, step, conductance),)
+        return (diffuse(filled, iterations, kappa, step, conductance, missing),)
 
     return ops.apply_in_blocks(layer, ops.at_least_float32(image)).to(image.dtype)
 
@@ -84,20 +86,32 @@ def _warn_of_unit(image: Tensor, kappa: float | Tensor) -> None:
 
 
 def diffuse(
-    x: Tensor, iterations: int, kappa: float | Tensor, step: float, conductance: str
+    x: Tensor,
+    iterations: int,
+    kappa: float | Tensor,
+    step: float,
+    conductance: str,
+    missing: Tensor | None,
 ) -> Tensor:
-    """:func:`anisotropic_diffusion` of checked arguments."""
+    """:func:`anisotropic_diffusion` of checked arguments, in which missing pixels are filled."""
+    inside_x = inside_y = None
+    if missing is not None:  # no flow across the border of what is valid, either
+        inside_x = F.pad(ops.nearest_in_box(missing, -1).diff(dim=-1).to(x.dtype), (1, 1))
+        inside_y = F.pad(ops.nearest_in_box(missing, -2).diff(dim=-2).to(x.dtype), (0, 0, 1, 1))
     for _ in range(iterations):
         p = ops.replicate_pad(x, 1)  # no difference, hence no flow, across the border
         # The flow between two neighbours is computed once and enters both with opposite signs.
-        flow_x = _flow(p[..., 1:-1, 1:] - p[..., 1:-1, :-1], kappa, conductance)
-        flow_y = _flow(p[..., 1:, 1:-1] - p[..., :-1, 1:-1], kappa, conductance)
+        flow_x = _flow(p[..., 1:-1, 1:] - p[..., 1:-1, :-1], kappa, conductance, inside_x)
+        flow_y = _flow(p[..., 1:, 1:-1] - p[..., :-1, 1:-1], kappa, conductance, inside_y)
         x = torch.add(x, flow_x[..., 1:], alpha=step).sub_(flow_x[..., :-1], alpha=step)
         x = x.add_(flow_y[..., 1:, :], alpha=step).sub_(flow_y[..., :-1, :], alpha=step)
-    return x
+    return ops.replicate_box(x, missing)
 
 
-def _flow(difference: Tensor, kappa: float | Tensor, conductance: str) -> Tensor:
+def _flow(
+    difference: Tensor, kappa: float | Tensor, conductance: str, inside: Tensor | None
+) -> Tensor:
+    difference = difference if inside is None else difference * inside
     # The range of a tensor cannot be checked while tracing.
     scaled = difference * (
         1.0 / (kappa.clamp(min=1e-6, max=1e6) if isinstance(kappa, Tensor) else kappa)
@@ -141,14 +155,15 @@ def multiscale_curvilinear_saliency(
     checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
     contrast = ops.check_scalar(kappa, "kappa")
 
-    def layer(image: Tensor) -> ops.Planes:
+    def layer(image: Tensor, missing: Tensor | None) -> ops.Planes:
         _warn_of_unit(image, contrast)
         level = image
-        field, saliency = _normalised_saliency(level, checked_sigma)
+        field, saliency = _normalised_saliency(level, checked_sigma, missing)
         lowest = saliency
         for k in range(scales - 1):
-            level = diffuse(level, 5 * 2 ** max(k - 1, 0), contrast, DIFFUSION_STEP, "rational")
-            level_field, level_saliency = _normalised_saliency(level, checked_sigma)
+            steps = 5 * 2 ** max(k - 1, 0)
+            level = diffuse(level, steps, contrast, DIFFUSION_STEP, "rational", missing)
+            level_field, level_saliency = _normalised_saliency(level, checked_sigma, missing)
             # On a CPU, selection by arithmetic is much faster than argmax and gather.
             field = torch.lerp(field, level_field, (level_saliency > saliency).to(field.dtype))
             saliency = torch.maximum(saliency, level_saliency)
@@ -158,11 +173,13 @@ def multiscale_curvilinear_saliency(
     return ops.apply_to_photograph(layer, image)
 
 
-def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, Tensor]:
+def _normalised_saliency(
+    level: Tensor, sigma: float | Tensor, missing: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Vectors of the image CS of one level, and their lengths, with maximum 1 over the image."""
     gx, gy = ops.central_gradient(ops.smooth(level, sigma))
     saliency = ops.squared_length(gx, gy)
-    peak = ops.image_maximum(saliency)
+    peak = ops.image_maximum(saliency, missing)
     saliency = saliency / torch.where(peak > 0, peak, 1.0)
     return ops.stack_channels(*scaled_direction(saliency, gx, gy)), saliency
 

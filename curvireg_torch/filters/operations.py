@@ -53,8 +53,9 @@ def at_least_float32(x: Tensor) -> Tensor:
     return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
 
 
-def image_maximum(x: Tensor) -> Tensor:
-    """(B, 1, 1, 1) maximum of each image."""
+def image_maximum(x: Tensor, mask: Tensor | None = None) -> Tensor:
+    """(B, 1, 1, 1) maximum of each image, whose values are >= 0, where ``mask`` is False."""
+    x = x if mask is None else torch.where(mask, 0.0, x)
     return x.amax(dim=(1, 2, 3), keepdim=True)
 
 
@@ -117,49 +118,20 @@ MAX_HOLE_LEVELS = 5
 
 
 def apply_to_photograph(
-    layer: Callable[[Tensor], Planes], image: Tensor, *, missing_value: float = 0.0
+    layer: Callable[[Tensor, Tensor | None], Planes], image: Tensor, *, missing_value: float = 0.0
 ) -> Tensor:
-    """Apply ``layer`` to grey levels; missing pixels are filled from their surroundings and give
-    ``missing_value``."""
+    """Apply ``layer`` to grey levels and the mask of missing pixels, None without any; these are
+    filled from their surroundings and give ``missing_value``."""
     check_colour_image(image)
-
-    def on_filled(x: Tensor, mask: Tensor) -> Planes:
-        planes = layer(fill_missing(x, mask))
-        return tuple(torch.where(mask, missing_value, plane) for plane in planes)
 
     def on_photographs(x: Tensor) -> Planes:
         if not may_have_missing(x):
-            return layer(x)
+            return layer(x, None)
         mask = missing_mask(x)
-        if not is_host_readable(x) or not _has_empty_border(mask):
-            return on_filled(x, mask)
-        # Each of a padded batch by itself, without what is padded: as it would be alone.
-        each = zip(x.split(1), mask.split(1), strict=True)
-        parts = [_on_inside(on_filled, *one, missing_value) for one in each]
-        return tuple(torch.cat(planes) for planes in zip(*parts, strict=True))
+        planes = layer(fill_missing(x, mask), mask)
+        return tuple(torch.where(mask, missing_value, plane) for plane in planes)
 
     return apply_in_blocks(on_photographs, to_grey(at_least_float32(image))).to(image.dtype)
-
-
-def _has_empty_border(mask: Tensor) -> bool:
-    """Whether the first or the last row or column of an image is missing."""
-    sides = (mask[..., 0, :], mask[..., -1, :], mask[..., 0], mask[..., -1])
-    return any(side.all(dim=-1).any() for side in sides)
-
-
-def _on_inside(
-    layer: Callable[[Tensor, Tensor], Planes], x: Tensor, mask: Tensor, missing_value: float
-) -> Planes:
-    """``layer`` of the bounding box of the valid pixels of one image, and ``missing_value`` beyond
-    it. An image without any is its own box."""
-    H, W = x.shape[-2:]
-    valid = ~mask[0, 0]
-    rows = valid.any(dim=1).nonzero().flatten().tolist() or [0, H - 1]
-    columns = valid.any(dim=0).nonzero().flatten().tolist() or [0, W - 1]
-    inside = (..., slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-    beyond = (columns[0], W - 1 - columns[-1], rows[0], H - 1 - rows[-1])
-    planes = layer(x[inside], mask[inside])
-    return tuple(F.pad(plane, beyond, value=missing_value) for plane in planes)
 
 
 def to_grey(image: Tensor) -> Tensor:
@@ -193,37 +165,46 @@ def fill_missing(x: Tensor, mask: Tensor | None = None) -> Tensor:
         if not may_have_missing(x):
             return x
         mask = missing_mask(x)
-    x, mask = _replicated_box(x, mask)
-    sums = [torch.where(mask, 0.0, x)]
-    weights = [(~mask).to(x.dtype)]
+    x = replicate_box(x, mask)
+    mask = replicate_box(mask, mask)
+    # whole cells at all levels: sizes that are rounded would need a compiled graph each
+    side = 2**MAX_HOLE_LEVELS
+    whole = (0, -x.shape[-1] % side, 0, -x.shape[-2] % side)
+    sums = [F.pad(torch.where(mask, 0.0, x), whole)]
+    weights = [F.pad((~mask).to(x.dtype), whole)]
     for _ in range(MAX_HOLE_LEVELS):
-        sums.append(F.avg_pool2d(sums[-1], 2, ceil_mode=True))
-        weights.append(F.avg_pool2d(weights[-1], 2, ceil_mode=True))
+        sums.append(F.avg_pool2d(sums[-1], 2))
+        weights.append(F.avg_pool2d(weights[-1], 2))
     tiny = torch.finfo(x.dtype).tiny
     fill = sums[-1].sum(dim=(2, 3), keepdim=True) / weights[-1].sum(dim=(2, 3), keepdim=True).clamp(
         min=tiny
     )
     for total, weight in zip(sums[:0:-1], weights[:0:-1], strict=True):
-        coarser = fill[..., : weight.shape[-2], : weight.shape[-1]]
-        fill = torch.where(weight > 0, total / weight.clamp(min=tiny), coarser)
+        fill = torch.where(weight > 0, total / weight.clamp(min=tiny), fill)
         fill = F.interpolate(fill, scale_factor=2.0, mode="nearest")
     return torch.where(mask, fill[..., : x.shape[-2], : x.shape[-1]], x)
 
 
-def _replicated_box(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """``x`` and ``mask`` with the pixels outside of the bounding box of those that are valid
-    replaced by the nearest ones in it."""
-    for dim, other in ((-2, -1), (-1, -2)):
-        last = x.shape[dim] - 1
-        index = torch.arange(last + 1, device=x.device)
-        index = index[:, None] if dim == -2 else index
-        seen = ~mask.all(dim=other, keepdim=True)
-        low = torch.where(seen, index, last).amin(dim=dim, keepdim=True)
-        high = torch.where(seen, index, 0).amax(dim=dim, keepdim=True)
-        nearest = torch.minimum(torch.maximum(index, low), high).expand_as(x)
-        x = x.gather(dim, nearest)
-        mask = mask.gather(dim, nearest)
-    return x, mask
+def replicate_box(x: Tensor, missing: Tensor | None) -> Tensor:
+    """``x`` with the pixels outside of the bounding box of those that are valid replaced by the
+    nearest ones in it, as at the border of an image; ``x`` itself without a mask."""
+    if missing is None:
+        return x
+    for dim in (-2, -1):
+        x = x.gather(dim, nearest_in_box(missing, dim).expand_as(x))
+    return x
+
+
+def nearest_in_box(missing: Tensor, dim: int) -> Tensor:
+    """(B, C, H, 1) or (B, C, 1, W) index along ``dim``, -2 or -1, of the nearest row or column of
+    the bounding box of valid pixels."""
+    last = missing.shape[dim] - 1
+    index = torch.arange(last + 1, device=missing.device)
+    index = index[:, None] if dim == -2 else index
+    seen = ~missing.all(dim=-3 - dim, keepdim=True)
+    low = torch.where(seen, index, last).amin(dim=dim, keepdim=True)
+    high = torch.where(seen, index, 0).amax(dim=dim, keepdim=True)
+    return torch.minimum(torch.maximum(index, low), high)
 
 
 def warn_of_range(image: Tensor, reason: str) -> None:
@@ -273,7 +254,7 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
 def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = False) -> Tensor:
     """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite
     differences need it: ``linear`` by the slope at the borders, else by replicating them."""
-    readable = not isinstance(sigma, Tensor) or is_host_readable(sigma)
+    readable = not x.is_meta and (not isinstance(sigma, Tensor) or is_host_readable(sigma))
     if linear or prefers_shifts(x, sigma) or not readable:
         weights = _gaussian_kernel(sigma, x)
         pad = _extrapolate_pad if linear else replicate_pad

@@ -31,6 +31,10 @@ class TestLayers(LayerContract):
             found = tensors(case(x))
         torch.testing.assert_close(found, tensors(case(x)), rtol=0.0, atol=0.0)
 
+    def test_meta_gives_shapes(self, case):
+        x = case.inputs(2, SIZE)
+        assert case.twin().to("meta")(x.to("meta")).shape == case(x).shape
+
 
 @pytest.mark.parametrize(
     "layer", [x for x in LAYERS.values() if x.inputs is depths], ids=lambda x: x.name
@@ -68,15 +72,28 @@ class TestCompiled:
         "hog": [{"clip": c} for c in (0.2, 0.3, 0.4)],
     }
 
+    @pytest.mark.parametrize("name", ["ig", "cs", "hog"])
+    def test_two_graphs_are_enough_for_sizes_beyond_32_px(self, name):
+        torch._dynamo.reset()
+        function, inputs = PAIRS[name][:2]
+        counter = CompileCounter()
+        graph = torch.compile(function, fullgraph=True, backend=counter)
+        for n, height, width in ((2, 40, 40), (3, 50, 70), (5, 90, 37), (4, 101, 60)):
+            x = inputs(n, 101)[..., :height, :width]
+            assert LayerContract().agrees(graph(x), function(x))
+        assert counter.frame_count == 2
+
     @pytest.mark.parametrize("name", list(values))
-    def test_any_value_of_a_float_option(self, name):
+    def test_each_value_of_a_float_option_has_its_graph(self, name):
         """At the second value of a float torch.compile makes it a symbol."""
         torch._dynamo.reset()
         function, inputs = PAIRS[name][:2]
         x = inputs(2, 24)
-        graph = torch.compile(function, fullgraph=True, backend="eager")
+        counter = CompileCounter()
+        graph = torch.compile(function, fullgraph=True, backend=counter)
         for options in self.values[name]:
             assert LayerContract().agrees(graph(x, **options), function(x, **options)), options
+        assert counter.frame_count == len(self.values[name])
 
 
 @pytest.mark.slow

@@ -72,7 +72,7 @@ def test_depth_layers_broadcast_masks():
     assert torch.equal(
         filters.hessian_frobenius_norm(depth, each), filters.hessian_frobenius_norm(depth)
     )
-    for wrong in (mask[:23], mask.expand(2, 1, 24, 24), mask[None, None, None], depth):
+    for wrong in (mask[:23], mask.expand(2, 1, 24, 24), mask[None, None, None], depth, 1.0):
         with refused(r"mask: expected bool of shape \(3, 1, 24, 24\)"):
             filters.average_shading_gradient(depth, wrong)
 
