@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from ..errors import InvalidInputError
 from ..utils.aliases import Document, Fields
 from ..utils.checks import check_positive
 
@@ -18,7 +19,8 @@ def _positive_option(name: str) -> property:
     same, but their modules cannot be pickled.)"""
 
     def value(self: "FunctionModule") -> Any:
-        log = self._parameters.get(f"log_{name}")
+        # an attribute, for copies of nn.DataParallel have no parameters
+        log = getattr(self, f"log_{name}", None)
         return self._fixed[name] if log is None else log.exp()
 
     def assign(self: "FunctionModule", new: Any) -> None:
@@ -26,8 +28,11 @@ def _positive_option(name: str) -> property:
         if log is None:
             self._fixed[name] = new
             return
+        values = torch.as_tensor(new, dtype=torch.float64)
+        if not ((values > 0) & values.isfinite()).all():
+            raise InvalidInputError(f"{name}: expected finite values > 0, got {new!r:.40}")
         with torch.no_grad():
-            log.copy_(torch.as_tensor(new, dtype=torch.float64).log())
+            log.copy_(values.log())
 
     return property(value, assign)
 

@@ -3,6 +3,7 @@ their dtype."""
 
 import copy
 import io
+import math
 import pickle
 
 import pytest
@@ -197,7 +198,22 @@ def test_state_of_learnable_and_fixed_modules_says_what_to_do():
     assert fixed[0].options == {"sigma": 3.0}
 
 
+@pytest.mark.parametrize(("make", "size"), [(filters.ImageGradient, 1), (cr.HOG, 2)])
+def test_learnable_modules_are_replicated_by_data_parallel(make, size):
+    module = make(learnable=True)
+    x = torch.rand(1, size, 16, 16, generator=seeded(0))
+    copied = module._replicate_for_data_parallel()
+    for name, parameter in module.named_parameters():
+        setattr(copied, name, 1.0 * parameter)  # no parameter, as in torch.nn.parallel.replicate
+    assert torch.equal(copied(x), module(x))
+
+
 def test_learnable_options_reject_values_that_are_not_positive():
+    module = filters.ImageGradient(learnable=True)
+    for value in (-1.0, 0.0, math.nan, math.inf, torch.tensor(-1.0)):
+        with refused("sigma: expected finite values > 0"):
+            module.sigma = value
+    assert float(module.sigma.detach()) == 1.0
     for call, message in (
         (
             lambda: filters.ImageGradient(sigma=0.0, learnable=True),
