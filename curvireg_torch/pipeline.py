@@ -42,6 +42,15 @@ CUSTOM = "custom:"  # Prefix of the name of a field that is passed with each cal
 Settings = TypeVar("Settings")
 
 
+def _convert_integers(
+    settings: object, names: tuple[str, ...], *, prefix: str = "", least: int = 1
+) -> None:
+    """Replace integers, as of numpy, by Python's, which JSON has."""
+    for name in names:
+        value = check_integer(getattr(settings, name), f"{prefix}{name}", least=least)
+        object.__setattr__(settings, name, value)
+
+
 @dataclass(frozen=True)
 class ViewPolicy:
     """Which viewpoints a bank contains.
@@ -140,15 +149,16 @@ class BankSettings:
         check_option(self.camera, ("perspective", "orthographic"), "camera")
         check_option(self.depth_field, DEPTH_FIELDS, "depth_field")
         check_positive(self.margin, "margin", zero_ok=True)
+        _convert_integers(self, ("image_size", "grid", "bins", "block"))
         if self.image_size < self.grid:
             raise InvalidInputError(
                 f"image_size: expected at least grid = {self.grid}, got {self.image_size}"
             )
         check_option(self.formula, FORMULAS, "formula")
         check_positive(self.sigma, "sigma", zero_ok=True)
-        if not 1 <= self.block <= self.grid or self.bins < 1 or not 0.0 < self.clip <= 1.0:
+        if self.block > self.grid or not 0.0 < self.clip <= 1.0:
             raise InvalidInputError(
-                f"hog: expected 1 <= block <= grid, bins >= 1 and clip in (0, 1], got {self}"
+                f"hog: expected 1 <= block <= grid and clip in (0, 1], got {self}"
             )
 
 
@@ -244,11 +254,10 @@ class FitSettings:
     def __post_init__(self) -> None:
         angles = tuple(check_positive(angle, "fit: wide_angles") for angle in self.wide_angles)
         object.__setattr__(self, "wide_angles", angles)
-        for name in ("screened_views", "least_hypotheses", "kept_starts", "finished_fits"):
-            check_integer(getattr(self, name), f"fit: {name}")
-        check_integer(self.min_keypoints, "fit: min_keypoints", least=4)
-        for name in ("close_rivals", "chance_keypoints"):
-            check_integer(getattr(self, name), f"fit: {name}", least=0)
+        counts = ("screened_views", "least_hypotheses", "kept_starts", "finished_fits")
+        _convert_integers(self, counts, prefix="fit: ")
+        _convert_integers(self, ("min_keypoints",), prefix="fit: ", least=4)
+        _convert_integers(self, ("close_rivals", "chance_keypoints"), prefix="fit: ", least=0)
         for name in ("start_angle", "start_roll", "far_angle", "same_pose_angle"):
             check_positive(getattr(self, name), f"fit: {name}")
         for name in ("screening_weight", "close_score"):

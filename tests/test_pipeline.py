@@ -1,6 +1,7 @@
 import json
 from dataclasses import FrozenInstanceError, fields, replace
 
+import numpy as np
 import pytest
 import torch
 import trimesh
@@ -110,6 +111,15 @@ def test_json_contains_every_setting():
         assert Pipeline.from_json(pipeline.to_json()) == pipeline
     with pytest.raises(FrozenInstanceError):
         base.box_jitter = 0.0
+
+
+def test_integers_of_numpy_become_those_of_json():
+    bank = BankSettings(image_size=np.int64(64), bins=np.int32(9))
+    fit = FitSettings(kept_starts=np.int64(4), close_rivals=np.int64(0))
+    pipeline = Pipeline(bank=bank, fit=fit)
+    assert Pipeline.from_json(pipeline.to_json()) == pipeline
+    with refused("image_size: expected an integer"):
+        BankSettings(image_size=64.0)
 
 
 WRONG = """\

@@ -80,18 +80,18 @@ class ObjectCrops(Dataset[dict[str, Tensor]]):
                 "dataset: crops are cut by the boxes as annotated, which its transforms may move; "
                 "make it without transforms="
             )
-        check_integer(size, "size")
         check_positive(margin, "margin", zero_ok=True)
         if not hasattr(bins, "__len__") or len(bins) != len(_ANGLES):
             raise InvalidInputError(
                 f"bins: expected a number for each of {', '.join(_ANGLES)}, got {bins!r:.40}"
             )
-        for name, count in zip(_ANGLES, bins, strict=True):
-            check_integer(count, f"bins of {name}")
         self.dataset = dataset
-        self.size = size
+        self.size = check_integer(size, "size")
         self.margin = margin
-        self.bins = tuple(bins)
+        self.bins = tuple(
+            check_integer(count, f"bins of {name}")
+            for name, count in zip(_ANGLES, bins, strict=True)
+        )
         self.transform = transform
         names = [str(item.get("category", item.get("obj_id"))) for item in dataset._items]
         self.classes = sorted(set(names), key=_numeric_order)

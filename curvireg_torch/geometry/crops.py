@@ -165,7 +165,7 @@ def crop_images(
     for image in images:
         check_tensor(image, "images", (None, None, None))
         check_tensor(image, "images", (len(images[0]), None, None))
-    check_integer(size, "size")
+    size = check_integer(size, "size")
     boxes = as_boxes(boxes, len(images))
     check_boxes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])
     squares = square_boxes(boxes, margin)

@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
@@ -70,6 +71,11 @@ BOXES = r"""
 def test_check_boxes_refuses_boxes_without_pixels(box, words):
     with refused(rf"box 1 .*{words}"):
         check_boxes(torch.tensor([[0.0, 0.0, 5.0, 5.0], box]), [(20, 30), (20, 30)])
+
+
+def test_crop_images_takes_sizes_of_numpy():
+    crops, _ = g.crop_images(ramp(8, 8), [[1, 1, 5, 5]], size=np.int64(6))
+    assert crops.shape == (1, 2, 6, 6)
 
 
 def test_crop_images_refuses_a_list_of_grey_and_colour():
