@@ -32,7 +32,7 @@ from ..rendering import DepthRenderer
 from ..terms import Appearance
 from ..utils.aliases import Fields, PathName
 from ..utils.arrays import Array
-from ..utils.checks import check_finite, check_symmetries, check_tensor
+from ..utils.checks import check_device, check_finite, check_symmetries, check_tensor
 from ..utils.files import tensor_checksum, write_tensors
 from ..utils.likes import MeshLike
 from ..utils.threads import single_threaded_pool
@@ -203,6 +203,7 @@ class ViewBank:
             >>> len(bank), bank.descriptors.shape
             (4, torch.Size([4, 1764]))
         """
+        check_device(device)
         mesh = as_mesh(mesh)
         pipeline = pipeline or Pipeline()
         given = {"image_size": image_size, "camera": camera}
@@ -244,6 +245,7 @@ class ViewBank:
 
     def to(self, device: torch.device | str) -> "ViewBank":
         """The same bank on another device."""
+        check_device(device)
         bank = ViewBank(
             self.mesh, self.views, self.pipeline, {k: v.to(device) for k, v in self.tensors.items()}
         )

@@ -93,7 +93,8 @@ def check_device(name: torch.device | str, option: str = "device") -> None:
     """``name`` is a device on which torch computes on this machine."""
     try:
         torch.zeros(1, device=name).item()
-    except (RuntimeError, AssertionError) as error:  # builds of torch without CUDA raise the second
+    # builds of torch without CUDA raise the second, a dtype the third
+    except (RuntimeError, AssertionError, TypeError) as error:
         usable = ", ".join(["cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))])
         message = f"torch cannot use {str(name)!r} on this machine; choose from {usable}"
         raise InvalidInputError(f"{option}: {message}") from error

@@ -136,6 +136,17 @@ def test_load_refuses_changed_bits_and_truncated_and_missing_files(saved):
         ViewBank.load(saved.with_name("none"))
 
 
+@pytest.mark.parametrize("device", ["foo", "cuda:99", torch.float16])
+def test_banks_refuse_what_is_no_device_of_this_machine(small_bank, saved, device):
+    message = f"device: torch cannot use '{device}' on this machine"
+    with refused(message):
+        small_bank.to(device)
+    with refused(message):
+        ViewBank.load(saved, device=device)
+    with refused(message):
+        ViewBank.build(small_bank.mesh, device=device)
+
+
 @pytest.mark.parametrize(
     ("metadata", "message"),
     [
