@@ -1,8 +1,8 @@
 """Fields to descriptors and point masks, their whitening, and networks: the learned field and the
 ImageNet backbone.
 
-Descriptors keep the dtype (half types compute in float32). Wrong shapes, dtypes and options raise
-:class:`~curvireg_torch.errors.InvalidInputError`.
+HOG, its points and the learned field keep the dtype (half types compute in float32); wrong images,
+fields and options raise :class:`~curvireg_torch.errors.InvalidInputError`.
 """
 
 from .hog import HOG, field_points, hog
