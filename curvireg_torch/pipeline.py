@@ -374,7 +374,8 @@ class Pipeline:
                 f"field: expected weights {self.weights}, got packaged {SHA256[:16]}; pass the "
                 f"module (field=...)"
             )
-        return FIELDS[self.field]()
+        # one that is trained is passed by the caller
+        return FIELDS[self.field]().requires_grad_(False)
 
     def stored_appearance(self, count: int) -> Appearance | None:
         """The appearance term, if a bank of ``count`` views holds the features of all its views."""

@@ -202,6 +202,11 @@ def test_a_hook_of_any_kind_calls_the_field(kind):
     assert seen.count(field) == 1
 
 
+def test_only_fields_of_the_caller_record_gradients(small_bank, matcher):
+    assert not scores(matcher).requires_grad
+    assert scores(ViewMatcher(small_bank, field=LearnedCurvilinearSaliency())).requires_grad
+
+
 def test_gradients_reach_the_photograph_without_a_warning():
     image, box, _ = scene(0)
     image = image.clone().requires_grad_()
