@@ -125,7 +125,8 @@ def run_entries(
             if isinstance(finished, WorkerError):
                 # without the photograph's digest: the next run tries it again
                 digests = {"request": task.request, "photo": ""}
-                finished = Finished({"digests": digests, **failed_row(finished)}, None)
+                row = failed_row(finished, seconds={"bank": 0.0, "register": 0.0})
+                finished = Finished({"digests": digests, **row}, None)
             if finished.picture is not None:
                 write_file(_thumbnail_path(out, finished.row["digests"]), finished.picture)
             store.append({"key": task.entry.key, **finished.row})

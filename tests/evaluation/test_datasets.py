@@ -8,11 +8,12 @@ import trimesh
 
 from curvireg_torch import Camera, rotation_error
 from curvireg_torch.cli import main, parse
-from curvireg_torch.errors import MeshError, RenderingError
+from curvireg_torch.errors import MeshError, RenderingError, WorkerError
 from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.jobs import runner
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Registrar
+from curvireg_torch.utils.executors import Workers
 from tests._support import double, eye, refused
 from tests._support.lists import bop_poses, lines, table
 from tests._support.small import SMALL, rows_of, run
@@ -95,6 +96,17 @@ def test_objects_fail_alone(bop, tmp_path):
     assert "entirely outside" in rows[second.key]["message"]
     assert "rotation" in rows[third.key]
     assert summary["failed"] == 3, "and a photograph of one colour"
+
+
+def test_a_photograph_that_ends_its_worker_is_one_that_failed(bop, tmp_path):
+    class AllLost(Workers):
+        def map(self, function, state, blocks):
+            for block in blocks:
+                yield from ((task, WorkerError("workers: a process ended")) for task in block)
+
+    benchmark = BOPBenchmark(bop, ANY)
+    summary = run(benchmark, tmp_path / "out", limit=1, workers=AllLost())
+    assert (summary["n"], summary["failed"], summary["seconds"]["register"]) == (1, 1, 0.0)
 
 
 @pytest.mark.slow
