@@ -276,6 +276,9 @@ class RegisterOptions:
 
     def open_files(self) -> None:
         """Read the files that options name, so that a mistake in one is found before any work."""
+        from ..formats.meshes.files import check_textures
+
+        check_textures(self.textures)
         self.open_pipeline()
         self.read_start()
         _ = self.network, self._box_file

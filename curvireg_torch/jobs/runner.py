@@ -19,6 +19,7 @@ from ..errors import (
     InvalidInputError,
     LostObjectError,
     MeshError,
+    MissingDependencyError,
     MissingFileError,
     WorkerError,
 )
@@ -86,7 +87,8 @@ def run_entries(
     Entries of the same meshes follow each other, so that a worker has only one bank in memory. The
     ``workers``, by default this process, take blocks of them; this process alone writes: each row
     is on disk as soon as its block is done. An input that cannot be used makes a row with
-    ``failed`` as ``verdict`` and does not stop the others.
+    ``failed`` as ``verdict`` and does not stop the others; the next run reads files again that
+    could not be read.
 
     Returns:
         The store, which holds all entries.
@@ -166,7 +168,7 @@ class _OpenedRegistrar:
         start = time.perf_counter()
         try:
             self._registrar = self._open(meshes)
-        except (MeshError, BankError, MissingFileError, OSError) as error:
+        except (MeshError, BankError, MissingDependencyError, MissingFileError, OSError) as error:
             self._registrar = error
         self._meshes = meshes
         return self._registrar, time.perf_counter() - start
@@ -181,6 +183,9 @@ def _register_block(opened: _OpenedRegistrar, tasks: Sequence[Task]) -> list[Fin
         {"request": task.request, "photo": _photo_digest(task.entry, digest_of)} for task in tasks
     ]
     rows = _rows([task.entry for task in tasks], registrar, bank_seconds=bank_seconds)
+    for known, (row, _) in zip(digests, rows, strict=True):
+        if "skipped" in row:  # perhaps for want of a decoder: the next run tries it again
+            known["photo"] = ""
     return [
         Finished({"digests": known, **row}, picture)
         for known, (row, picture) in zip(digests, rows, strict=True)

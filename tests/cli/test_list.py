@@ -203,6 +203,7 @@ def test_register_files_folders_and_patterns(folder, register, document, refused
         assert np.abs(np.subtract(one["rotation"], other["rotation"])).max() < 1e-3
     assert not (tmp_path / "one" / "results.csv").exists()
     refused(register(folder / "nothing*.png", *bank), "nothing*.png: no photographs")
+    refused(register(photos, *bank, "--textures", folder / "none"), "the folder of the textures")
 
 
 def test_register_chooses_among_meshes(folder, register, document, tmp_path, capsys):

@@ -10,7 +10,13 @@ import pytest
 import torch
 
 from curvireg_torch import Camera, PosePrior
-from curvireg_torch.errors import InvalidInputError, MeshError, WorkerError
+from curvireg_torch.errors import (
+    InvalidInputError,
+    MeshError,
+    MissingDependencyError,
+    MissingFileError,
+    WorkerError,
+)
 from curvireg_torch.formats.poses import PoseRecord
 from curvireg_torch.jobs import runner
 from curvireg_torch.jobs.entry import Entry
@@ -204,6 +210,22 @@ def test_a_photograph_that_ends_its_worker_fails_and_is_tried_again(entries, tmp
     row = registered.store.read("1a")
     assert (row["verdict"], row["message"]) == ("failed", "workers: a process ended")
     assert registered(entries, tmp_path / "out") == ["1a"]
+
+
+@pytest.mark.parametrize("error", [MissingDependencyError, MissingFileError, MeshError])
+@pytest.mark.parametrize("name", ["image", "mesh"])
+def test_files_that_could_not_be_read_are_tried_again(name, error, entries, tmp_path, monkeypatch):
+    """A decoder is installed, or another folder of textures given, and no file changes."""
+    steps = {"image": Mock(), "mesh": Mock()}
+    steps[name].side_effect = error("install it")
+    monkeypatch.setattr(Entry, "read", steps["image"])
+    for count in (1, 2):
+        store = run_entries(
+            entries[:1], tmp_path, steps["mesh"], settings={}, label="", progress=False
+        )
+        row = store.read("0a")
+        assert (row["skipped"], row["message"]) == (f"unreadable_{name}", "install it")
+        assert steps[name].call_count == count
 
 
 def test_the_first_of_a_block_pays_for_the_bank(monkeypatch):

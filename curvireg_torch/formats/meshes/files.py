@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import CurviregError, MeshError, MissingFileError
+from ...errors import CurviregError, MeshError, MissingDependencyError, MissingFileError
 from ...utils.aliases import PathName
 from ...utils.choices import MESHES
 from ...utils.files import file_digest, foreign_content, text_digest
@@ -93,11 +93,16 @@ def read_mesh(
         raise MeshError(
             f"expected a mesh file ({', '.join(MESHES)}); convert it first", subject=path
         )
-    if textures is not None and not Path(textures).is_dir():
-        raise MissingFileError("no such folder; check the folder of the textures", subject=textures)
+    check_textures(textures)
     source = MeshSource(path, [] if textures is None else [Path(textures)])
     found = read_source(source, link)
     return replace(found, warnings=tuple(source.warnings))
+
+
+def check_textures(folder: PathName | None) -> None:
+    """Refuse a folder of textures that does not exist."""
+    if folder is not None and not Path(folder).is_dir():
+        raise MissingFileError("no such folder; check the folder of the textures", subject=folder)
 
 
 def read_source(source: MeshSource, link: str | None = None) -> ReadMesh:
@@ -115,6 +120,8 @@ def read_source(source: MeshSource, link: str | None = None) -> ReadMesh:
             if suffix == ".urdf":
                 return read_urdf(source, read_source, link)
             return READERS[suffix](source)
+    except MissingDependencyError:
+        raise  # it names the file
     except CurviregError as error:
         raise error.with_subject(path) from None
     except Exception as error:

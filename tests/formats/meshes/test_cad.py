@@ -100,7 +100,7 @@ def test_the_message_names_the_extra(write, monkeypatch, suffix, package, extra)
     text = str(caught.value)
     assert f"pip install 'curvireg_torch[{extra}]'" in text
     assert f"in a checkout pip install -e '.[{extra}]'" in text
-    assert f"a.{suffix}: " in text
+    assert text.count(f"a.{suffix}") == 1
 
 
 @pytest.mark.slow
