@@ -175,8 +175,8 @@ def _compared(
         first, second = np.concatenate(summaries, axis=1)
         value_a = float(summarise(a))
         value_b = float(summarise(b))
-        difference = value_b - value_a
-        differences = second - first
+        difference = float(_differences(value_a, value_b))
+        differences = _differences(first, second)
     return Comparison(
         score=score,
         n=len(a),
@@ -190,6 +190,11 @@ def _compared(
         losses=losses,
         p=p,
     )
+
+
+def _differences(a: Any, b: Any) -> Array:
+    """b - a; 0 where both are infinite."""
+    return np.where(a == b, 0.0, np.subtract(b, a))
 
 
 def _quantiles(values: Array) -> Interval:

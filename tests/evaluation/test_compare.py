@@ -66,7 +66,13 @@ def test_a_run_equals_itself(runs):
     run = read_run(runs[0])
     for each in compare(run, run):
         assert (each.difference, each.wins, each.losses, each.p) == (0.0, 0, 0, 1.0)
-        assert each.score == "med_err_deg" or each.difference_interval == (0.0, 0.0)
+        assert each.difference_interval == (0.0, 0.0)
+
+
+def test_the_medians_of_two_runs_with_as_many_failures_as_poses_differ_by_nothing(tmp_path):
+    errors = {str(k): "inf" if k < 5 else 5 for k in range(9)}
+    median = compare(*(read_run(write_run(tmp_path / name, errors)) for name in "ab"))[-1]
+    assert (median.a, median.difference, median.difference_interval) == (math.inf, 0.0, (0.0, 0.0))
 
 
 def test_intervals_of_many_objects_are_narrow_and_hold_the_truth(tmp_path):
