@@ -173,7 +173,10 @@ class Pascal3DPlus(ObjectDataset):
 
     def _parse(self, entry: MatStruct, category: str) -> Sample | str:
         """The sample of one object, or the reason to skip it."""
-        if entry.get("class") != category:
+        name = entry.get("class")
+        if not isinstance(name, str):
+            return "corrupt_annotation"
+        if name != category:
             return "other_class"
         flags = {name: bool(_number(entry.get(name)) or 0) for name in self._excluded}
         for name, excluded in self._excluded.items():

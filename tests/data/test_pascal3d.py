@@ -110,6 +110,15 @@ def test_pascal3d_defaults_of_missing_camera_fields_and_invalid_cad_indices(root
     assert skipped["missing_mesh"] == before + len(invalid)
 
 
+def test_objects_without_a_class_are_corrupt(root):
+    record = root / "Annotations" / "car_pascal" / "2008_000001.mat"
+    nameless = pascal_object("car")
+    del nameless["class"]
+    before = cars(root).skipped
+    write_record(record, [nameless])
+    assert cars(root).skipped - before == {"corrupt_annotation": 1}
+
+
 def test_photographs_of_another_size_than_annotated_are_left_out(root):
     resized = root / "Images" / "car_pascal" / "2008_000002.jpg"
     write_image(resized, (30, 40))
