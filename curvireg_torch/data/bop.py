@@ -28,6 +28,7 @@ Counts = dict[tuple[int, int, int], int]
 _README = "datasets/bop/README.md"
 _TRUTH = "scene_gt"
 _UNKNOWN_BOX = (math.nan,) * 4
+MAX_TARGETS = 1000  # of one object in one image: each that is missing is counted by its name
 MAX_DIAMETERS = 20.0  # of a mesh over its distance: beyond, it is in mm and the poses in metres
 
 
@@ -67,8 +68,8 @@ class BOPDataset(ObjectDataset):
     Raises:
         MissingFileError: the root, the split's folder, models or a required target list does not
             exist.
-        InvalidInputError: one of those files is damaged, or meshes have another unit than
-            ``models_info.json``.
+        InvalidInputError: one of those files is damaged, two scenes have one number, or meshes have
+            another unit than ``models_info.json``.
 
     Example:
         >>> BOPDataset("data/bop/lm")[0]["translation"]  # doctest: +SKIP
@@ -105,12 +106,13 @@ class BOPDataset(ObjectDataset):
                 f"no scene, which is a folder with a number as 000001; {_README} shows the layout",
                 subject=scenes,
             )
+        _check_numbers(numbered)
         _check_sensors(scenes, numbered)
         for folder in numbered:
             self._index(folder, counts)
         self._check_unit()
-        if counts:  # targets that were not found
-            for scene_id, image_id, obj_id in sorted(counts):
+        for (scene_id, image_id, obj_id), missing in sorted((counts or {}).items()):
+            for _ in range(missing):
                 self._skip(
                     "missing_annotation", f"{split}/{scene_id:06d}/{image_id:06d} object {obj_id}"
                 )
@@ -156,27 +158,25 @@ class BOPDataset(ObjectDataset):
             if not key.isdecimal() or not isinstance(instances, list):
                 self._skip("corrupt_annotation", item)
                 continue
-            samples: list[Sample] = []
-            for index, entry in enumerate(instances):
-                parsed = self._parse(entry, entry_at(infos.get(key), index), cameras.get(key))
-                if isinstance(parsed, str):
-                    self._skip(parsed, f"{item} #{index}")
-                else:
-                    ids = {"scene_id": int(folder.name), "image_id": int(key)}
-                    samples.append({**parsed, **ids, "instance_index": index})
-            image = images.get(int(key))
-            left_out = _no_targets(samples, counts)
-            for sample in samples:
-                index = sample["instance_index"]
-                parsed = sample if image is not None else "missing_image"
-                if index in left_out:
-                    parsed = "no_target"
-                self._add(parsed, f"{item} #{index}", image_path=str(image))
+            scene_id = int(folder.name)
+            image_id = int(key)
+            image = images.get(image_id)
+            seen = [entry_at(infos.get(key), index) for index in range(len(instances))]
+            left_out = _no_targets(scene_id, image_id, instances, seen, counts)
+            for index, (entry, info) in enumerate(zip(instances, seen, strict=True)):
+                parsed: Sample | str = "no_target"
+                if index not in left_out:
+                    parsed = self._parse(entry, info, cameras.get(key))
+                    if image is None and not isinstance(parsed, str):
+                        parsed = "missing_image"
+                ids = {"scene_id": scene_id, "image_id": image_id, "instance_index": index}
+                self._add(parsed, f"{item} #{index}", **ids, image_path=str(image))
         return None
 
     def _parse(self, entry: object, info: Fields, camera: object) -> Sample | str:
         """The sample of one instance, or the reason to skip it."""
-        if not isinstance(entry, dict) or not isinstance(entry.get("obj_id"), int):
+        obj_id = _obj_id(entry)
+        if not isinstance(entry, dict) or obj_id is None:
             return "corrupt_annotation"
         if not isinstance(camera, dict):
             return "missing_annotation"
@@ -189,14 +189,12 @@ class BOPDataset(ObjectDataset):
             check_camera_matrix(torch.tensor(_rows(matrix), dtype=torch.float64), "cam_K")
         except InvalidInputError:
             return "corrupt_annotation"
-        obj_id: int = entry["obj_id"]
         if "bbox_obj" in info:
             box = bop_box(info["bbox_obj"])
         elif (box := self._box_of_mesh(obj_id, rotation, translation, _rows(matrix))) is None:
             return "behind_camera"
         if box is None or box[0] == box[2] or box[1] == box[3]:
             return "bad_box"
-        visible = finite_numbers([info.get("visib_fract")], 1)
         model = self._models.files.get(obj_id)
         if model is None:
             return "missing_mesh"
@@ -210,7 +208,7 @@ class BOPDataset(ObjectDataset):
             "translation": translation,
             "T_cam_from_world": _camera_pose(camera),
             "obj_id": obj_id,
-            "visib_fract": math.nan if visible is None else visible[0],
+            "visib_fract": _visible_fraction(info),
             "model_path": str(model),
             "model_info": self.models_info[obj_id],
         }
@@ -241,6 +239,17 @@ def _missing_split(root: Path, scenes: Path) -> MissingFileError:
     elif below:
         advice = f"give the folder of one set: {', '.join(sorted(map(str, below)))}; "
     return MissingFileError(f"no such folder; {advice}{_README} shows the layout", subject=scenes)
+
+
+def _check_numbers(numbered: Sequence[Path]) -> None:
+    """Refuse scenes whose numbers differ in their zeros alone."""
+    by_number: dict[int, Path] = {}
+    for folder in numbered:
+        other = by_number.setdefault(int(folder.name), folder)
+        if other != folder:
+            raise InvalidInputError(
+                f"has the number of the scene {other.name}; leave one of them out", subject=folder
+            )
 
 
 def _check_sensors(scenes: Path, numbered: Sequence[Path]) -> None:
@@ -309,27 +318,52 @@ def _targets(path: Path) -> Counts:
             raise InvalidInputError(
                 f"expected entries with the numbers {', '.join(keys)}, got {entry!r}", subject=path
             )
+        if entry["inst_count"] > MAX_TARGETS:
+            raise InvalidInputError(
+                f"expected inst_count up to {MAX_TARGETS:,}, got {entry!r}", subject=path
+            )
         counts[entry["scene_id"], entry["im_id"], entry["obj_id"]] = entry["inst_count"]
     return counts
 
 
-def _no_targets(samples: list[Sample], counts: Counts | None) -> set[int]:
-    """The ``instance_index`` of samples of one image that are no targets; removes its targets from
-    ``counts``."""
+def _no_targets(
+    scene_id: int,
+    image_id: int,
+    instances: Sequence[object],
+    infos: Sequence[Fields],
+    counts: Counts | None,
+) -> set[int]:
+    """The indices of the instances of one image that are no targets, whether or not they can be
+    used; takes those that are, the most visible ones, from ``counts``."""
+    left_out: set[int] = set()
     if counts is None:
-        return set()
-    keys = [(s["scene_id"], s["image_id"], s["obj_id"]) for s in samples]
-    remaining = {key: counts.pop(key, 0) for key in set(keys)}
-    left_out = set()
+        return left_out
+    visible = [_visible_fraction(info) for info in infos]
     # stable: ties keep their order
-    for sample, key in sorted(
-        zip(samples, keys, strict=True),
-        key=lambda pair: 1.0 if math.isnan(pair[0]["visib_fract"]) else -pair[0]["visib_fract"],
+    for index in sorted(
+        range(len(instances)), key=lambda i: 1.0 if math.isnan(visible[i]) else -visible[i]
     ):
-        if remaining[key] <= 0:
-            left_out.add(sample["instance_index"])
-        remaining[key] -= 1
+        obj_id = _obj_id(instances[index])
+        if obj_id is None:
+            continue
+        key = (scene_id, image_id, obj_id)
+        if counts.get(key, 0) > 0:
+            counts[key] -= 1
+        else:
+            left_out.add(index)
     return left_out
+
+
+def _obj_id(entry: object) -> int | None:
+    """The object of an entry of ``scene_gt.json``; None if it names none."""
+    obj_id = entry.get("obj_id") if isinstance(entry, dict) else None
+    return obj_id if isinstance(obj_id, int) else None
+
+
+def _visible_fraction(info: Fields) -> float:
+    """NaN if it is not known."""
+    visible = finite_numbers([info.get("visib_fract")], 1)
+    return math.nan if visible is None else visible[0]
 
 
 def entry_at(infos: object, index: int) -> Fields:

@@ -1,4 +1,5 @@
 import json
+from collections import Counter
 from operator import setitem
 
 import pytest
@@ -86,12 +87,44 @@ def test_targets_select_the_most_visible_instances(root):
     for targets in (None, True):
         dataset = BOPDataset(root, targets=targets)
         assert ids(dataset) == [(1, 0, 1, 2), (2, 7, 1, 0)]
-        assert dataset.skipped["no_target"] == 3
+        assert dataset.skipped["no_target"] == 10
         assert "test/000001/000006 object 1" in dataset.skipped_items["missing_annotation"]
+        assert dict(dataset.skipped - Counter(no_target=10)) == {
+            "corrupt_annotation": 3,  # of no object, no number, and a file
+            "missing_annotation": 2,
+        }
     (root / "test_targets_bop19.json").unlink()
     assert len(BOPDataset(root)) == 4
     with refused("test_targets_bop19", MissingFileError):
         BOPDataset(root, targets=True)
+
+
+def test_each_target_that_cannot_be_used_is_counted_once(root):
+    """3: an object without a mesh; 4: no photograph; 5: no camera; 0: three of five are missing."""
+    objects = {(0, 1): 5, (3, 8): 1, (4, 1): 1, (5, 1): 1, (6, 1): 2}
+    names = ("scene_id", "im_id", "obj_id", "inst_count")
+    targets = [(1, *key, count) for key, count in objects.items()]
+    content = [dict(zip(names, target, strict=True)) for target in targets]
+    (root / "test_targets_bop19.json").write_text(json.dumps(content))
+    dataset = BOPDataset(root)
+    assert ids(dataset) == [(1, 0, 1, 0), (1, 0, 1, 2)]
+    skipped = dataset.skipped_items
+    assert (skipped["missing_mesh"], skipped["missing_image"]) == (
+        ["test/000001/3 #3"],
+        ["test/000001/4 #0"],
+    )
+    assert Counter(skipped["missing_annotation"]) == {
+        "test/000001/000000 object 1": 3,
+        "test/000001/000006 object 1": 2,
+        "test/000001/5 #0": 1,
+        "test/000004/scene_gt.json": 1,
+    }
+
+
+def test_scenes_of_one_number_are_refused(root):
+    (root / "test" / "1").mkdir()
+    with refused("test/1: has the number of the scene 000001"):
+        BOPDataset(root)
 
 
 def test_other_splits_have_no_targets_by_default(root):
@@ -132,7 +165,8 @@ def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(
     for folder, split in ((root / "nothing", "test"), (root, "train"), (root, "../test")):
         with refused(r"datasets/bop/README\.md", MissingFileError):
             BOPDataset(folder, split)
-    for content in ("[", "[" * 100000, "[1]", '[{"scene_id": 1}]', "{}"):
+    many = '[{"scene_id": 1, "im_id": 0, "obj_id": 1, "inst_count": 1001}]'
+    for content in ("[", "[" * 100000, "[1]", '[{"scene_id": 1}]', "{}", many):
         (root / "test_targets_bop19.json").write_text(content)
         with refused("test_targets_bop19"):
             BOPDataset(root)
