@@ -18,7 +18,7 @@ from ..errors import InvalidInputError, OutputError
 from ..formats.exports import ros, trackers
 from ..utils.aliases import Document
 from ..utils.files import check_writable, read_json, write_file
-from .store import to_json
+from .store import THUMBNAILS, to_json
 
 try:
     import fcntl
@@ -30,7 +30,7 @@ MARK = b"curvireg"  # in each bank and picture
 
 FOR_TOOLS = (*ros.FILES, *trackers.M3T_FILES, *trackers.VISP_FILES)
 ONE_RESULT = ("result.json", "overlay.png", "pose.glb", *FOR_TOOLS)
-RESUMED = ("results.jsonl", "thumbnails")
+RESUMED = ("results.jsonl", THUMBNAILS)
 ROWS = (*RESUMED, "index.html")
 FILES: dict[str, tuple[str, ...]] = {
     "register": ONE_RESULT,

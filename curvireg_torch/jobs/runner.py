@@ -37,7 +37,7 @@ from .documents import SCHEMA, line_document, places_document
 from .entry import Entry, prepare
 from .options import with_advice
 from .photograph import RegisteredPhotograph, register_entries
-from .store import ResultStore, Row, has_pose
+from .store import ResultStore, Row, has_pose, thumbnail_path
 
 NOT_IN_RESULTS = ("cli", "viewer", "visualization")
 """Parts of the package that no stored result depends on."""
@@ -130,7 +130,7 @@ def run_entries(
                 row = failed_row(finished, seconds={"bank": 0.0, "register": 0.0})
                 finished = Finished({"digests": digests, **row}, None)
             if finished.picture is not None:
-                write_file(_thumbnail_path(out, finished.row["digests"]), finished.picture)
+                write_file(thumbnail_path(out, finished.row["digests"]), finished.picture)
             store.append({"key": task.entry.key, **finished.row})
             bar.update()
     return store
@@ -254,11 +254,6 @@ def failed_row(error: Exception | str, **values: Any) -> Row:
     return {"schema": SCHEMA, "verdict": verdict, "message": message, **values}
 
 
-def _thumbnail_path(out: Path, digests: Mapping[str, str]) -> Path:
-    """Where the picture of a result in the folder ``out`` is."""
-    return out / "thumbnails" / f"{digests['request']}.jpg"
-
-
 def thumbnail_of(out: Path, row: Row) -> Path | None:
     """The picture of a row; None if it has no pose."""
-    return _thumbnail_path(out, row["digests"]) if has_pose(row) else None
+    return thumbnail_path(out, row["digests"]) if has_pose(row) else None

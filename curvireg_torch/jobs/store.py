@@ -3,12 +3,17 @@
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError, OutputError
 from ..utils.files import write_file
+
+THUMBNAILS = "thumbnails"
+_DIGEST = re.compile("[0-9a-f]{16}")
 
 Row = dict[str, Any]
 Rows = Sequence[Row]
@@ -31,6 +36,11 @@ def finite(value: Any) -> Any:
 def to_json(value: Any) -> str:
     """Indented JSON; numbers that are not finite become null."""
     return json.dumps(finite(value), indent=2, allow_nan=False) + "\n"
+
+
+def thumbnail_path(folder: Path, digests: Mapping[str, str]) -> Path:
+    """Where the picture of a result in a folder is."""
+    return folder / THUMBNAILS / f"{digests['request']}.jpg"
 
 
 class ResultStore:
@@ -99,8 +109,17 @@ class ResultStore:
         self._add(line)
 
     def rewrite(self, rows: Iterable[Row]) -> None:
-        """Replace ``results.jsonl`` by ``rows``."""
-        write_file(self.path, b"".join(map(_line, rows)))
+        """Replace ``results.jsonl`` by ``rows``; thumbnails that belong to none of them go."""
+        lines = []
+        kept = set()
+        for row in rows:
+            lines.append(_line(row))
+            kept.add(thumbnail_path(self.folder, row["digests"]))
+        write_file(self.path, b"".join(lines))
+        for path in (self.folder / THUMBNAILS).glob("*.jpg"):
+            if _DIGEST.fullmatch(path.stem) and path not in kept:
+                with suppress(OSError):
+                    path.unlink()
 
     def sort(self, keys: Sequence[str]) -> None:
         """Write one row of each key: first of these keys in their order, then of others."""

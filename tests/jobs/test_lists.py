@@ -32,7 +32,7 @@ from tests._support import (
     unrefined,
     write_photo,
 )
-from tests._support.lists import table
+from tests._support.lists import lines, table
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
 LENS = replace(CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0))
@@ -90,8 +90,14 @@ def test_results_of_photographs_that_a_list_no_longer_names_go(registrar, entry,
     rows = [replace(entry, name=name, cells={column: f"{name} "}) for name in ("a.png", "b.png")]
     register_rows(rows, tmp_path / "out", registrar)
     register_rows(rows, tmp_path / "out", registrar)
+    pictures = tmp_path / "out" / "thumbnails"
+    (pictures / "holiday.jpg").write_text("of the user")
+    assert len(list(pictures.iterdir())) == 3
     with pytest.warns(CurviregWarning, match="out: 1 results of photographs"):
         register_rows(rows[:1], tmp_path / "out", registrar)
+    (row,) = lines(tmp_path / "out")
+    left = {path.name for path in pictures.iterdir()}
+    assert left == {"holiday.jpg", f"{row['digests']['request']}.jpg"}
 
 
 def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
