@@ -190,7 +190,7 @@ def test_a_half_hollow_box_looks_alike_from_above_and_not_from_below():
     mesh = as_mesh(half_solid_box())
     bank = bank_of(mesh)
     registrar = Registrar(bank, mesh_is="exact")
-    assert registrar.symmetries_of(exact=True).shape[0] == 1
+    assert registrar.symmetries_of(exact=True) is None
     pairs = look_alikes(bank, registrar.describer, None)
     elevation = cr.viewpoint_from_rotation(torch.stack([pair.rotation for pair in pairs]))[1]
     alike = torch.tensor([pair.is_alike for pair in pairs])
