@@ -87,8 +87,8 @@ def run_entries(
     Entries of the same meshes follow each other, so that a worker has only one bank in memory. The
     ``workers``, by default this process, take blocks of them; this process alone writes: each row
     is on disk as soon as its block is done. An input that cannot be used makes a row with
-    ``failed`` as ``verdict`` and does not stop the others; the next run reads files again that
-    could not be read.
+    ``failed`` as ``verdict`` and does not stop the others; the next run reads files again for which
+    a package was missing.
 
     Returns:
         The store, which holds all entries.
@@ -183,11 +183,8 @@ def _register_block(opened: _OpenedRegistrar, tasks: Sequence[Task]) -> list[Fin
         {"request": task.request, "photo": _photo_digest(task.entry, digest_of)} for task in tasks
     ]
     rows = _rows([task.entry for task in tasks], registrar, bank_seconds=bank_seconds)
-    for known, (row, _) in zip(digests, rows, strict=True):
-        if "skipped" in row:  # perhaps for want of a decoder: the next run tries it again
-            known["photo"] = ""
     return [
-        Finished({"digests": known, **row}, picture)
+        Finished({"digests": known | row.pop("digests", {}), **row}, picture)
         for known, (row, picture) in zip(digests, rows, strict=True)
     ]
 
@@ -230,13 +227,20 @@ def _prepared(entry: Entry, registrar: Registrar | Exception) -> Photograph | Cu
     try:
         photo = entry.read()
     except (CurviregError, OSError) as error:
-        return failed_row(error, skipped="unreadable_image")
+        return _unreadable(error, "image")
     if isinstance(registrar, Exception):
-        return failed_row(registrar, skipped="unreadable_mesh")
+        return _unreadable(registrar, "mesh")
     try:
         return prepare(entry, photo)
     except CurviregError as error:
         return error
+
+
+def _unreadable(error: Exception, kind: str) -> Row:
+    """The row of a file that could not be read. Without a digest, the next run tries it again:
+    where a package is missing, no file need change."""
+    unknown = {"digests": {"photo": ""}} if isinstance(error, MissingDependencyError) else {}
+    return failed_row(error, skipped=f"unreadable_{kind}", **unknown)
 
 
 def _thumbnail(found: RegisteredPhotograph) -> bytes:
