@@ -27,6 +27,7 @@ from ..mesh.mesh import (
     principal_rotation,
 )
 from ..mesh.reflections import is_its_own_mirror_image
+from ..mesh.round_axis import RoundAxis, round_axis
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
 from ..terms import Appearance
@@ -40,7 +41,7 @@ from .cells import Packing, packing_of_views
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
 FORMAT = "curvireg_torch.ViewBank"
-FORMAT_VERSION = 12
+FORMAT_VERSION = 13
 PIXELS_AT_A_TIME = 72 * 128**2  # of views that a thread holds in memory, about 60 bytes each
 TURNS = 24  # in-plane rotations of the default views: quarter turns among them share a rendering
 VIEWS_ON_DEVICE = 480  # the same on another device than the CPU
@@ -286,6 +287,9 @@ class ViewBank:
         contents["extreme_points"] = extreme_points(self.mesh)
         if not self.mesh.has_colours:
             contents["mesh_symmetries"] = mesh_symmetries(self.mesh)
+        axis = round_axis(self.mesh)
+        if axis is not None:
+            contents["round_axis"] = torch.stack([axis.direction, axis.point])
         angle = self._compared_angle()
         if angle is not None:
             contents |= {f"packing.{name}": x for name, x in self.packing(angle)._asdict().items()}
@@ -297,6 +301,7 @@ class ViewBank:
             "unit": self.mesh.unit or "",
             "up": self.mesh.up,
             "is_its_own_mirror_image": str(is_its_own_mirror_image(self.mesh)),
+            "ends_are_alike": json.dumps(axis and axis.ends_are_alike),
             "warnings": json.dumps([asdict(warning) for warning in self.mesh.warnings]),
             "packing": json.dumps(angle),
             "checksum": tensor_checksum(contents),
@@ -410,6 +415,7 @@ def _mesh(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> Mesh:
     if len(mesh.faces) > VIEW_FACES:
         measures["view_mesh"] = _triangles(tensors, "view_mesh")
     measures["is_its_own_mirror_image"] = metadata["is_its_own_mirror_image"] == "True"
+    measures["round_axis"] = _round_axis(tensors, json.loads(metadata["ends_are_alike"]))
     _check_extreme_points(mesh)
     if not mesh.has_colours:
         check_symmetries(mesh_symmetries(mesh))
@@ -436,6 +442,16 @@ def _triangles(tensors: Mapping[str, Tensor], name: str) -> trimesh.Trimesh:
     mesh = trimesh.Trimesh(vertices=vertices.double().numpy(), faces=faces.numpy(), process=False)
     checked_triangles(mesh, name)
     return mesh
+
+
+def _round_axis(tensors: Mapping[str, Tensor], ends_are_alike: bool | None) -> RoundAxis | None:
+    """The axis of a mesh that is nearly round, whose ends are alike, or not; else None."""
+    if ends_are_alike is None:
+        return None
+    axis = tensors["round_axis"]
+    check_tensor(axis, "round_axis", (2, 3))
+    check_finite(axis, "round_axis")
+    return RoundAxis(axis[0], axis[1], ends_are_alike)
 
 
 def _check_extreme_points(mesh: Mesh) -> None:
@@ -480,20 +496,18 @@ def _check_contents(
     for name, width in widths.items():
         x = tensors[name]
         # A sum in float32 is finite if all half-precision values are, and fast.
-        if x.shape != (N, width) or (
-            x.is_floating_point() and not x.sum(dtype=torch.float32).isfinite()
-        ):
+        total = x.sum(dtype=torch.float32) if x.is_floating_point() else None
+        if x.shape != (N, width) or (total is not None and not total.isfinite()):
             raise ValueError(f"{name}: not of the shape that the settings say, or not finite")
+        if name == "descriptors" and not total:
+            raise ValueError("descriptors that are all zero")
     if any(tensors[name].dtype != torch.uint8 for name in ("points", "silhouettes")):
         raise ValueError("points, silhouettes: expected uint8")
     if not all(x.isfinite().all() for x in views.columns().values()):
         raise ValueError("viewpoints that are not finite")
-    if (
-        not tensors["descriptors"].any()
-        # a sheet that is seen from its edge has a box of no height
-        or not (tensors["boxes"][:, 2:] >= tensors["boxes"][:, :2]).all()
-    ):
-        raise ValueError("descriptors that are all zero, or boxes of negative size")
+    # a sheet that is seen from its edge has a box of no height
+    if not (tensors["boxes"][:, 2:] >= tensors["boxes"][:, :2]).all():
+        raise ValueError("boxes of negative size")
 
 
 def _packings(

@@ -20,6 +20,7 @@ from curvireg_torch.matching.describe import view_mesh
 from curvireg_torch.mesh import MeshWarning, mesh_symmetries, reflections, symmetry
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.mesh.reflections import is_its_own_mirror_image
+from curvireg_torch.mesh.round_axis import round_axis
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Correlation
@@ -104,7 +105,8 @@ def test_a_file_keeps_what_is_known_of_the_mesh(small_bank, tmp_path):
     bank.save(tmp_path / "bank.safetensors")
     loaded = ViewBank.load(tmp_path / "bank.safetensors").mesh
     assert {name: getattr(loaded, name) for name in known} == known
-    assert {"extreme_points", "mesh_symmetries", "is_its_own_mirror_image"} <= set(loaded.measures)
+    slow = {"extreme_points", "mesh_symmetries", "is_its_own_mirror_image", "round_axis"}
+    assert slow <= set(loaded.measures)
 
 
 def test_save_and_load(small_bank, tmp_path):
@@ -177,6 +179,7 @@ def with_nan(x):
     ("name", "by", "message"),
     [
         ("descriptors", with_nan, "not finite"),
+        ("descriptors", lambda x: 0 * x, "descriptors that are all zero"),
         ("boxes", lambda x: x[:, [2, 1, 0, 3]], "boxes of negative size"),
         ("boxes", lambda x: x[1:], "boxes: not of the shape"),
         ("points", lambda x: x[:, 1:], "points: not of the shape"),
@@ -218,6 +221,21 @@ def test_load_restores_whether_a_mesh_is_its_own_mirror_image(is_lopsided, tmp_p
     build(mesh, TWO).save(path := tmp_path / "bank")
     monkeypatch.setattr(reflections, "cKDTree", None)  # would fail
     assert is_its_own_mirror_image(ViewBank.load(path).mesh) is not is_lopsided
+
+
+@pytest.mark.parametrize("radii", [(1.0, 1.0), (1.0, 0.5), (1.0, 2.0)])
+def test_load_restores_the_axis_of_a_round_mesh(radii, tmp_path, monkeypatch):
+    cone = trimesh.creation.revolve([(0.0, 0.0), (radii[0], 0.0), (radii[1], 3.0), (0.0, 3.0)])
+    bank = build(cone.apply_translation((4.0, 5.0, 6.0)), TWO)
+    bank.save(path := tmp_path / "bank.safetensors")
+    known = round_axis(bank.mesh)
+    monkeypatch.setattr("curvireg_torch.mesh.round_axis.cKDTree", None)  # would fail
+    loaded = round_axis(ViewBank.load(path).mesh)
+    assert loaded.ends_are_alike is known.ends_are_alike is (radii[0] == radii[1])
+    torch.testing.assert_close(loaded[:2], known[:2], rtol=0.0, atol=0.0)
+    change(path, "round_axis", lambda x: x[:, :2])
+    with refused("round_axis: expected shape", BankError):
+        ViewBank.load(path)
 
 
 def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
