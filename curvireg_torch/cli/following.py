@@ -23,6 +23,7 @@ from ..data import Photo, Video, read_photo
 from ..data.images import ANIMATED, frame_tensor
 from ..errors import CurviregError, ImageError, InvalidInputError
 from ..formats.boxes import pixel_box
+from ..formats.poses import PoseRecord
 from ..geometry import Camera, undistorted
 from ..geometry.crops import check_boxes
 from ..jobs.entry import camera_of, entry_of, start_in_unit
@@ -30,7 +31,7 @@ from ..jobs.lists import POSE_COLUMNS, find_photographs, is_video
 from ..jobs.opening import open_registrar
 from ..jobs.options import CAMERA_OPTIONS, RegisterOptions, prior_from_limits
 from ..jobs.outputs import output_folder
-from ..registration import FailedRegistration, Follower, Registrar, Registration
+from ..registration import FailedRegistration, Follower, Registrar, Registration, refine
 from ..registration.confidence import two_decimals
 from ..registration.tracking import BELIEVED_CONFIDENCE
 from ..utils.aliases import Fields
@@ -201,21 +202,31 @@ def _poses(
                 )
                 image = seen.image
                 box = seen.box
+            start = None
             if follow is None:
                 follow = Follower(registrar, _camera(options, photo), prior=prior)
-                if (start := options.read_start()) is not None:
-                    pose = start_in_unit(start, registrar.bank.mesh.unit)
-                    follow.start(
-                        image,
-                        pose,
-                        confidence=1.0 if start.confidence is None else start.confidence,
-                    )
-            result = follow(image, box)
+                start = options.read_start()
+            result = follow(image, box) if start is None else _started(follow, image, start)
         except CurviregError as error:
             if follow is None and options.boxes is None:
                 raise  # it would fail in each frame
             result = FailedRegistration(error)
         yield name, image, result, time.perf_counter() - begun
+
+
+def _started(
+    follow: Follower, image: Tensor, start: PoseRecord
+) -> Registration | FailedRegistration:
+    """The start, refined in the first frame, from which the object is followed. A tracker that
+    learned a wrong pose from a frame finds it again there."""
+    registrar = follow.registrar
+    pose = start_in_unit(start, registrar.bank.mesh.unit)
+    limit = [start.confidence]
+    (found,) = refine(registrar, [image], follow.camera_matrix, [pose], start_confidences=limit)
+    if isinstance(found, Registration):
+        known, _ = found.projection
+        follow.start(image, known, confidence=1.0 if found.confidence is None else found.confidence)
+    return found
 
 
 def _box(

@@ -393,7 +393,8 @@ class Follower:
 
     @torch.no_grad()
     def start(self, image: ImageLike, pose: ArrayLike, *, confidence: float = 1.0) -> None:
-        """Begin from a known pose, in place of registering the first frame.
+        """Begin from a known pose, in place of registering the first frame. It is taken as it is,
+        and not checked: :meth:`.Registrar.refine` does both.
 
         Args:
             image: the frame, see :class:`Registrar`.

@@ -1,4 +1,5 @@
 import json
+import math
 import pickle
 import re
 import shutil
@@ -7,6 +8,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import cv2
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -14,10 +16,18 @@ from curvireg_torch import data
 from curvireg_torch.cli import following, main
 from curvireg_torch.cli.following import Tally
 from curvireg_torch.data import Video
+from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Follower
 from curvireg_torch.visualization import OverlayVideo
-from tests._support import learned_registrar, sequence, slow_after, write_photo, write_video
+from tests._support import (
+    double,
+    learned_registrar,
+    sequence,
+    slow_after,
+    write_photo,
+    write_video,
+)
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, check_pose, table
 from tests._support.results import registration
@@ -262,6 +272,16 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(
     words = ["--camera", *CAMERA, "--start", tmp_path / "start.json", "--out", tmp_path / "out"]
     assert follow(*words, box=False) == 0
     assert check_poses(tmp_path / "out", frames)[0]["verdict"] == verdict
+
+
+def test_follow_refines_the_start(frames, follow, tmp_path):
+    """By 15 degrees about an axis of the object."""
+    T = frames[1][0][2].clone()
+    T[:3, :3] @= rotation_from_axis_angle(double([0.0, 0.0, math.radians(15.0)]))
+    np.savetxt(tmp_path / "start.txt", T.numpy())
+    words = ["--camera", *CAMERA, "--start", tmp_path / "start.txt", "--out", tmp_path / "out"]
+    assert follow(*words, source="turn.avi", box=False) == 0
+    check_poses(tmp_path / "out", frames)
 
 
 def test_a_start_without_a_camera_ends_the_run_at_once(frames, follow, tmp_path, capsys):
