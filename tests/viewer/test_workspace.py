@@ -2,9 +2,7 @@
 
 import asyncio
 import errno
-import io
 import json
-import os
 import re
 import secrets
 import shutil
@@ -15,13 +13,12 @@ import zipfile
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from PIL import Image
 
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError, OutputError
 from curvireg_torch.geometry import Camera
@@ -29,6 +26,7 @@ from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.viewer import workspace as module
 from curvireg_torch.viewer.parts import place_part
 from curvireg_torch.viewer.workspace import show_warning, unpack
+from curvireg_torch.visualization.encoding import png
 from tests._support import refused
 from tests.viewer.test_session import write_scene
 
@@ -67,12 +65,13 @@ def names(workspace):
     return [shot.path.name for shot in workspace.session.shots]
 
 
-def picture():
-    file = io.BytesIO()
-    Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3)).save(file, "PNG")
-    return file.getvalue()
+def fail(workspace, error):
+    """The message of a job that fails."""
+    assert asyncio.run(workspace.run("mesh", Mock(side_effect=error))) is None
+    return workspace.messages["mesh"]
 
 
+PICTURE = png(np.arange(192, dtype=np.uint8).reshape(8, 8, 3))
 TEXTURED = b"""mtllib a.mtl
 v 0 0 0
 v 1 0 0
@@ -210,7 +209,7 @@ def test_the_error_of_a_search_stands_where_its_inputs_are(workspace, scene, mon
 
 def test_what_a_mesh_names_is_part_of_it_and_no_photograph(workspace, scene):
     material = b"newmtl m\nmap_Kd maps/wood.png\n"
-    files = {"a.obj": TEXTURED, "a.mtl": material, "wood.png": picture()}
+    files = {"a.obj": TEXTURED, "a.mtl": material, "wood.png": PICTURE}
     for name, content in files.items():
         send(workspace, scene, name, content, is_first=name == "a.obj")
     assert (names(workspace), workspace.messages) == ([], {})
@@ -219,7 +218,7 @@ def test_what_a_mesh_names_is_part_of_it_and_no_photograph(workspace, scene):
     assert names(workspace) == ["plywood.png"], "only a whole name counts"
     send(workspace, scene / "photo.png", "wood.png")
     assert names(workspace) == ["plywood.png", "wood.png"], "its picture has come already"
-    assert (workspace.session.mesh_path.parent / "maps" / "wood.png").read_bytes() == picture()
+    assert (workspace.session.mesh_path.parent / "maps" / "wood.png").read_bytes() == PICTURE
 
 
 def test_a_part_without_a_place_is_a_message(workspace, scene):
@@ -315,7 +314,7 @@ def test_a_mesh_without_its_texture_is_not_called_coloured(workspace, tmp_path):
         assert workspace.session.mesh_facts.endswith(facts)
         assert "missing" in workspace.messages["mesh"]
         assert str(tmp_path) not in workspace.messages["mesh"]
-    send(workspace, pack(tmp_path / "a.zip", {**parts, "a.png": picture()}))
+    send(workspace, pack(tmp_path / "a.zip", {**parts, "a.png": PICTURE}))
     assert workspace.session.mesh_facts.endswith("rendered in its colours")
     assert workspace.messages == {}
     assert sorted(stored(workspace)) == ["a.mtl", "a.obj", "a.png"], "without the archive"
@@ -381,8 +380,7 @@ def test_warnings_and_defects_become_messages(workspace, capsys):
     assert workspace.messages == {"mesh": "a.obj: small"}
     assert asyncio.run(workspace.run("mesh", lambda: 5)) == 5
     assert workspace.messages == {}
-    assert asyncio.run(workspace.run("pose", Mock(side_effect=KeyError("x")))) is None
-    assert workspace.messages["pose"].startswith("KeyError: 'x'")
+    assert fail(workspace, KeyError("x")).startswith("KeyError: 'x'")
     assert "Traceback" in capsys.readouterr().err
 
 
@@ -564,30 +562,18 @@ def test_unpack_refuses_what_is_too_large_damaged_or_not_one_mesh(tmp_path, monk
     check({f"{k:0200}.txt": b"" for k in range(20)}, "more than 2 files")
 
 
-class FullDisk:
-    """A file on a disk that has no room."""
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        return False
-
-    def write(self, _):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
 def test_a_full_disk_is_said_and_leaves_nothing(workspace, scene, monkeypatch):
     message = r"^a\.png: cannot be stored \(No space left on device\); make room on the machine"
     full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "open", lambda *_, **__: FullDisk())
-        with refused(message, OutputError):
-            send(workspace, scene / "photo.png", "a.png", b"1")
-    with monkeypatch.context() as patch:
-        patch.setattr(module.tempfile, "mkdtemp", full)
-        with refused(message, OutputError):
-            send(workspace, scene / "photo.png", "a.png", b"1")
+    file = MagicMock()
+    file.__enter__.return_value.write = full
+    for owner, name, fails in (
+        (Path, "open", Mock(return_value=file)),
+        (module.tempfile, "mkdtemp", full),
+    ):
+        with monkeypatch.context() as patch, refused(message, OutputError):
+            patch.setattr(owner, name, fails)
+            send(workspace, scene, "a.png", b"1")
     assert (list(workspace.folder.iterdir()), workspace.receiving) == ([], {})
     monkeypatch.setattr(zipfile.ZipFile, "extractall", full)
     pack(scene / "a.zip", {"a.ply": b""})
@@ -608,16 +594,10 @@ def test_messages_have_no_temporary_folders(workspace):
         (f"{workspace.folder}-not/x", f"{workspace.folder}-not/x"),
         ("a/parts/b", "a/parts/b"),
     ):
-        asyncio.run(workspace.run("mesh", Mock(side_effect=InvalidInputError(text))))
-        assert workspace.messages["mesh"] == shown
-        asyncio.run(workspace.run("mesh", Mock(side_effect=KeyError(text))))
-        assert str(workspace.folder) + "/" not in workspace.messages["mesh"]
-    asyncio.run(
-        workspace.run("mesh", Mock(side_effect=OSError(36, "File name too long", f"{inside}/x")))
-    )
-    assert (
-        workspace.messages["mesh"] == "File name too long; check the machine on which the page runs"
-    )
+        assert fail(workspace, InvalidInputError(text)) == shown
+        assert f"{workspace.folder}/" not in fail(workspace, KeyError(text))
+    message = "File name too long; check the machine on which the page runs"
+    assert fail(workspace, OSError(36, "File name too long", f"{inside}/x")) == message
 
 
 def test_closing_ends_the_search_and_removes_the_uploads(workspace, scene, search):
