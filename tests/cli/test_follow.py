@@ -28,6 +28,7 @@ from tests._support import (
     write_photo,
     write_video,
 )
+from tests._support.calibrations import calibration
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, check_pose, table
 from tests._support.results import registration
@@ -62,17 +63,18 @@ def check_poses(folder, frames, degrees=4.0, share=0.04):
 
 
 @pytest.fixture
-def follow(frames):
-    """Run ``curvireg follow``, by default on the folder, with the box of the first frame, or from
-    its pose, which is quicker."""
+def follow(frames, tmp_path):
+    """Run ``curvireg follow``, by default on the folder, with the camera and the box of the first
+    frame, or from its pose, which is quicker; results go to ``tmp_path / out``."""
     folder, scenes = frames
 
-    def run(*options, source="shots", box=True, start=False):
-        source = str(folder / source) if (folder / source).exists() else source
-        place = ["--box", *map(str, scenes[0][1].tolist())] if box else []
-        place = ["--start", str(folder / "start.json")] if start else place
-        words = ["follow", source, str(folder / "truck.safetensors"), "--quiet", *place]
-        return main([*words, *map(str, options)])
+    def run(*options, source="shots", camera=CAMERA, box=True, start=False, out=""):
+        source = folder / source if (folder / source).exists() else source
+        place = ["--box", *scenes[0][1].tolist()] if box else []
+        place = ["--start", folder / "start.json"] if start else place
+        known = ["--camera", *camera] if camera else []
+        words = [source, folder / "truck.safetensors", *known, *place, "--out", tmp_path / out]
+        return main(["follow", "--quiet", *map(str, [*words, *options])])
 
     return run
 
@@ -93,16 +95,16 @@ def test_frames_without_a_certain_pose_are_spoken_of_once(confidences, said):
         assert tally.doubt() == (words and f"{words}; give --box or --start")
 
 
-def test_follow_says_that_it_is_not_sure(follow, tmp_path, monkeypatch, capsys):
+def test_follow_says_that_it_is_not_sure(follow, monkeypatch, capsys):
     monkeypatch.setattr(Follower, "__call__", lambda *_: registration(confidence=0.1))
-    follow("--camera", *CAMERA, "--out", tmp_path)
+    follow()
     error = capsys.readouterr().err
     assert error.count("curvireg: not sure of the object yet (best confidence 0.10)") == 1
 
 
 def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     _, scenes = frames
-    assert follow("--camera", *CAMERA, "--out", tmp_path) == 0
+    assert follow() == 0
     closing = capsys.readouterr().out
     assert "4 frames: 3 reliable, 0 unsure, 0 no match, 0 lost, 1 failed" in closing
     rate = re.search(r", ([\d.]+) frames per second; see", closing)
@@ -129,7 +131,7 @@ def boxes(monkeypatch):
 def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(
     frames, follow, boxes, tmp_path, capsys
 ):
-    assert follow("--camera", *CAMERA, "--out", tmp_path, "--json", source="turn.avi") == 0
+    assert follow("--json", source="turn.avi") == 0
     assert boxes() == [frames[1][0][1].tolist(), None, None]
     printed = capsys.readouterr()
     assert "3 frames: 3 reliable, 0 unsure" in printed.err
@@ -151,7 +153,7 @@ def test_an_animation_is_no_video(follow, tmp_path, capsys):
     """Of which one picture would be followed."""
     frames = [Image.new("RGB", (64, 48), (80 * k, 90, 90)) for k in range(3)]
     frames[0].save(tmp_path / "turn.webp", save_all=True, append_images=frames[1:])
-    assert follow("--json", source=tmp_path / "turn.webp", box=False) != 0
+    assert follow(source=tmp_path / "turn.webp", camera=(), box=False) != 0
     assert "an animation; save it as MP4" in capsys.readouterr().err
 
 
@@ -166,14 +168,13 @@ def test_follow_takes_the_boxes_of_a_detector_by_frame(frames, follow, boxes, tm
     labels.mkdir()
     (labels / "turn_1.txt").write_text(yolo)  # as ultralytics counts
     (labels / "turn-000002.txt").write_text("0 0.5 0.5 0.5 0.5\n")
-    words = ["--camera", *CAMERA, "--boxes", labels, "--out", tmp_path / "out"]
-    assert follow(*words, source="turn.avi", box=False) == 0
+    assert follow("--boxes", labels, source="turn.avi", box=False, out="out") == 0
     expected = pytest.approx(scenes[0][1].tolist(), abs=1e-3)
     assert boxes() == [expected, None, [59.5, 44.5, 179.5, 134.5]]
     check_pose(table(tmp_path / "out")[0], scenes[0][2], 4.0, 0.04)
     numbers = yolo.split()[1:]
-    more = ["--box", *numbers, "--box-format", "yolo", "--out", tmp_path / "more"]
-    assert follow("--camera", *CAMERA, *more, source="turn.avi", box=False) == 0
+    words = ["--box", *numbers, "--box-format", "yolo"]
+    assert follow(*words, source="turn.avi", box=False, out="more") == 0
     assert boxes()[3:] == [expected, None, None]
 
 
@@ -191,7 +192,7 @@ def test_follow_live_drops_frames_that_are_late(frames, follow, tmp_path, monkey
         return capture(file)
 
     monkeypatch.setattr(cv2, "VideoCapture", open_capture)
-    assert follow("--camera", *CAMERA, "--out", tmp_path, source=source, start=True) == 0
+    assert follow(source=source, start=True) == 0
     assert opened == [0 if source == "0" else source]
     names = [row["photo"] for row in table(tmp_path)]
     assert len(names) < 3
@@ -204,7 +205,7 @@ def test_follow_guesses_the_camera_from_the_first_frame(
 ):
     read = Mock(wraps=data.read_photo)
     monkeypatch.setattr(following, "read_photo", read)
-    assert follow(*words.split(), "--out", tmp_path) == 0
+    assert follow(*words.split(), camera=()) == 0
     assert [call.args[0].name for call in read.call_args_list] == [f"{k}.png" for k in range(4)]
     check_poses(tmp_path, frames)
 
@@ -219,13 +220,10 @@ def test_frames_of_another_size_scale_the_camera(frames, follow, tmp_path, kind)
     shutil.copy(folder / "shots" / "0.png", shots)  # has EXIF data
     cv2.imwrite(str(shots / "1.png"), cv2.resize(second, None, fx=2.0, fy=2.0))
     cv2.imwrite(str(shots / "2.png"), cv2.rotate(first, cv2.ROTATE_90_CLOCKWISE))
-    fx, fy, cx, cy = map(float, CAMERA)
-    matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-    calibration = tmp_path / "camera.json"
-    size = {"image_width": 240, "image_height": 180}
-    calibration.write_text(json.dumps({"camera_matrix": matrix, **size}))
-    words = ("--camera", calibration if kind == "file" else "exif")
-    assert follow(*words, "--out", tmp_path / "out", source=str(shots)) == 0
+    file = tmp_path / "camera.json"
+    file.write_text(calibration(260.0, 119.5, 89.5, image_width=240, image_height=180))
+    camera = [file if kind == "file" else "exif"]
+    assert follow(source=shots, camera=camera, out="out") == 0
     rows = table(tmp_path / "out")
     for row, (_, _, T) in zip(rows[:2], scenes, strict=False):
         check_pose(row, T, 4.0, 0.04)
@@ -236,17 +234,17 @@ def test_frames_of_another_size_scale_the_camera(frames, follow, tmp_path, kind)
 def test_follow_takes_the_exif_data_unasked_and_else_estimates_the_camera(
     frames, follow, tmp_path, capsys
 ):
-    assert follow("--out", tmp_path / "exif") == 0
+    assert follow(camera=(), out="exif") == 0
     assert "camera: from the file's EXIF" in capsys.readouterr().out
     check_poses(tmp_path / "exif", frames, 4.0, 0.1)
-    assert follow("--out", tmp_path / "none", source="turn.avi") == 0
+    assert follow(source="turn.avi", camera=(), out="none") == 0
     assert "camera: focal length estimated" in capsys.readouterr().out
     rows = check_poses(tmp_path / "none", frames, 8.0, 0.5)
     zooms = [
         float(row["tz"]) / float(T[2, 3]) for row, (_, _, T) in zip(rows, frames[1], strict=False)
     ]
     assert max(zooms) < 1.05 * min(zooms), "one camera for all frames"
-    assert follow("--mesh-is", "similar", "--out", tmp_path / "other") == 2
+    assert follow("--mesh-is", "similar", camera=(), out="other") == 2
     assert "needs the camera with --mesh-is similar" in capsys.readouterr().err
 
 
@@ -269,8 +267,7 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(
         return result
 
     monkeypatch.setattr(Follower, "_refined", unconfirmed)
-    words = ["--camera", *CAMERA, "--start", tmp_path / "start.json", "--out", tmp_path / "out"]
-    assert follow(*words, box=False) == 0
+    assert follow("--start", tmp_path / "start.json", box=False, out="out") == 0
     assert check_poses(tmp_path / "out", frames)[0]["verdict"] == verdict
 
 
@@ -279,22 +276,21 @@ def test_follow_refines_the_start(frames, follow, tmp_path):
     T = frames[1][0][2].clone()
     T[:3, :3] @= rotation_from_axis_angle(double([0.0, 0.0, math.radians(15.0)]))
     np.savetxt(tmp_path / "start.txt", T.numpy())
-    words = ["--camera", *CAMERA, "--start", tmp_path / "start.txt", "--out", tmp_path / "out"]
-    assert follow(*words, source="turn.avi", box=False) == 0
+    start = ["--start", tmp_path / "start.txt"]
+    assert follow(*start, source="turn.avi", box=False, out="out") == 0
     check_poses(tmp_path / "out", frames)
 
 
-def test_a_start_without_a_camera_ends_the_run_at_once(frames, follow, tmp_path, capsys):
-    words = ["--start", frames[0] / "start.json", "--out", tmp_path / "out"]
-    assert follow(*words, source="turn.avi", box=False) == 2
+def test_a_start_without_a_camera_ends_the_run_at_once(follow, capsys):
+    assert follow(source="turn.avi", camera=(), start=True) == 2
     error = capsys.readouterr().err
     assert "a start pose needs the camera; give it: --camera" in error
     assert "not sure" not in error
 
 
-def test_a_box_outside_the_first_frame_ends_the_run_at_once(follow, tmp_path, capsys):
-    words = ["--box", 1000, 1000, 1100, 1100, "--out", tmp_path / "out"]
-    assert follow(*words, source="turn.avi", box=False) == 2
+def test_a_box_outside_the_first_frame_ends_the_run_at_once(follow, capsys):
+    box = ["--box", 1000, 1000, 1100, 1100]
+    assert follow(*box, source="turn.avi", camera=(), box=False) == 2
     assert "entirely outside the" in capsys.readouterr().err
 
 
@@ -321,7 +317,7 @@ def test_follow_keeps_the_poses_before_an_interruption(
     if source == "0":
         monkeypatch.setattr(cv2, "VideoCapture", lambda _: Mock(wraps=camera, read=read))
     monkeypatch.setattr(OverlayVideo, "add", interrupted)
-    assert follow("--camera", *CAMERA, "--out", tmp_path, source=source, start=True) == code
+    assert follow(source=source, start=True) == code
     verdicts = [row["verdict"] for row in table(tmp_path)]
     if source == "0":
         assert verdicts == ["reliable"]
@@ -348,13 +344,13 @@ def test_follow_keeps_no_pose_in_memory_and_writes_each_at_once(follow, tmp_path
     assert str(tally).startswith(
         "1000 frames: 1000 reliable, 0 unsure, 0 no match, 0 lost, 0 failed, 2.0 frames per"
     )
-    assert follow("--camera", *CAMERA, "--out", tmp_path, start=True) == 0
+    assert follow(start=True) == 0
     assert rows == [1, 2, 3, 4]
 
 
 def test_follow_and_lists_do_not_overwrite_each_other(follow, tmp_path, capsys):
     (tmp_path / "results.csv").write_text("of others")
-    assert follow("--camera", *CAMERA, "--out", tmp_path) == 2
+    assert follow() == 2
     assert "results.csv: not written by this command" in capsys.readouterr().err
     assert (tmp_path / "results.csv").read_text() == "of others"
 
