@@ -6,11 +6,12 @@ import os
 
 import pytest
 
+from tests._support.calibrations import calibration
 from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos, written
 from tests.viewer.test_rig import HEADER, send
 
 IDENTITY = [1, 0, 0, 0, 1, 0, 0, 0, 1]
-CALIBRATION = {"camera_matrix": [260.0, 0, 119.5, 0, 260, 89.5, 0, 0, 1]}
+CALIBRATION = calibration(260.0, 119.5, 89.5)
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def outside(tmp_path):
     folder = tmp_path / "server"
     folder.mkdir()
     (folder / "secret").write_text("TOKEN-hunter2\nuser:root\n")
-    (folder / "cam.json").write_text(json.dumps(CALIBRATION))
+    (folder / "cam.json").write_text(CALIBRATION)
     (folder / "images").mkdir()
     return folder
 
@@ -53,7 +54,7 @@ def test_a_rig_on_the_page_reads_no_file_of_the_server(workspace, outside, tmp_p
 
 
 def test_a_calibration_of_the_uploads_is_found_whatever_folder_the_rig_says(workspace, tmp_path):
-    (tmp_path / "cam.json").write_text(json.dumps({"left": CALIBRATION, "right": CALIBRATION}))
+    (tmp_path / "cam.json").write_text(f'{{"left": {CALIBRATION}, "right": {CALIBRATION}}}')
     for camera in ("cam.json:left", "calibrations/cam.json:left", "C:\\my files\\cam.json:right"):
         session = send(workspace, tmp_path, rig_with_camera(tmp_path, camera), "cam.json")
         assert workspace.messages == {}

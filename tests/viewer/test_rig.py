@@ -4,7 +4,6 @@ import asyncio
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -17,13 +16,13 @@ from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.jobs.rigs import BOX, CAMERA, ROTATION, TRANSLATION
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as session_module
-from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.workspace import Workspace
 from tests._support import double, learned_registrar, refused
+from tests._support.calibrations import calibration
 from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos, written
 from tests.registration.test_several import WORLD
 from tests.viewer.test_session import document_of
-from tests.viewer.test_workspace import upload
+from tests.viewer.test_workspace import started, upload
 
 HEADER = ",".join(["photo", *BOX, *CAMERA, *ROTATION, *TRANSLATION])
 
@@ -50,10 +49,7 @@ def send(workspace, folder, *names):
 
 
 def search(workspace):
-    async def work():
-        await workspace.start_search()
-
-    asyncio.run(work())
+    asyncio.run(started(workspace))
     assert workspace.messages == {}
 
 
@@ -231,11 +227,8 @@ def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photo
     folder, rows = rig
     header = HEADER.replace(",".join(CAMERA), "camera")
     written(tmp_path / "rig.csv", header, *([*row[:5], "cam.json", *row[9:]] for row in rows))
-    calibration = {
-        "camera_matrix": [260.0, 0, 119.5, 0, 260, 89.5, 0, 0, 1],
-        "dist": [-0.2, 0, 0, 0, 0],
-    }
-    (tmp_path / "cam.json").write_text(json.dumps(calibration))
+    content = calibration(260.0, 119.5, 89.5, dist=[-0.2, 0, 0, 0, 0])
+    (tmp_path / "cam.json").write_text(content)
     session = send(workspace, folder, "0.png")
     send(workspace, tmp_path, "rig.csv")
     assert "cam.json: no such file" in workspace.messages["rig"]
@@ -287,19 +280,13 @@ def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
     assert session.command() == ""
 
 
-def test_of_two_photographs_of_one_name_the_first_has_the_row_of_the_rig():
-    row = SimpleNamespace(photo=Path("a/0.png"))
-    session = SimpleNamespace(rig={"0": row, "1": SimpleNamespace(photo=Path("1.png"))})
-    shots = [SimpleNamespace(path=Path("b/0.png"), view=row)]
-    assert Session._row_of(session, Path("c/0.PNG"), []) is row
-    assert Session._row_of(session, Path("c/0.PNG"), shots) is None
-    shots[0].view = None
-    assert Session._row_of(session, Path("c/0.PNG"), shots) is row
-
-
 def test_the_second_photograph_of_a_name_gets_the_row_once_the_first_is_removed(workspace, rig):
-    session = send(workspace, rig[0], "rig.csv", "0.png", "1.png", "0.png")
+    """Names count without folders and suffixes."""
+    folder = rig[0]
+    shutil.copy(folder / "0.png", folder / "0.jpg")
+    session = send(workspace, folder, "rig.csv", "0.png", "1.png", "0.jpg")
     first, other, second = session.shots
+    assert first.view is session.rig["0"]
     assert (second.view, session.shot) == (None, second)
     session.shot = first
     asyncio.run(workspace.remove_photo())

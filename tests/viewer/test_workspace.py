@@ -2,7 +2,6 @@
 
 import asyncio
 import errno
-import json
 import re
 import secrets
 import shutil
@@ -28,6 +27,7 @@ from curvireg_torch.viewer.parts import place_part
 from curvireg_torch.viewer.workspace import show_warning, unpack
 from curvireg_torch.visualization.encoding import png
 from tests._support import refused
+from tests._support.calibrations import calibration
 from tests.viewer.test_session import write_scene
 
 
@@ -106,11 +106,8 @@ def test_uploads_find_their_place(workspace, scene):
     session.shot = session.shots[0]
     asyncio.run(workspace.remove_photo())
     assert names(workspace) == ["b.png"]
-    calibration = {
-        "camera_matrix": [300.0, 0, 119.5, 0, 300, 89.5, 0, 0, 1],
-        "dist": [0.1, 0, 0, 0, 0],
-    }
-    send(workspace, scene, "cam.json", json.dumps(calibration).encode())
+    content = calibration(300.0, 119.5, 89.5, dist=[0.1, 0, 0, 0, 0])
+    send(workspace, scene, "cam.json", content.encode())
     assert session.shot.photo.notes == ("undistorted",)
     asyncio.run(workspace.remove_photo())
     assert (names(workspace), session.shot.photo) == ([], None)
@@ -268,11 +265,8 @@ def test_a_calibration_of_another_size_is_refused_beside_the_camera(workspace, s
     monkeypatch.setattr(
         session, "_opened", lambda *given: (seen.append(session.request().camera), opened(*given))
     )
-    calibration = {
-        "camera_matrix": [300.0, 0, 319.5, 0, 300, 89.5, 0, 0, 1],
-        "image_size": [640, 180],
-    }
-    send(workspace, scene, "cam.json", json.dumps(calibration).encode())
+    content = calibration(300.0, 319.5, 89.5, image_size=[640, 180])
+    send(workspace, scene, "cam.json", content.encode())
     assert workspace.messages["camera"].startswith("photo.png: camera: calibrated for 640 x 180")
     assert session.request().camera == (300.0, 300.0, 119.5, 89.5)
     assert seen == [(300.0, 300.0, 119.5, 89.5)]
