@@ -43,23 +43,6 @@ def test_sources_of_one_name_keep_their_own_results(folder, register, tmp_path, 
     assert [row["r11"] for row in table(tmp_path / "out")] == [row["r11"] for row in rows[::-1]]
 
 
-@pytest.mark.parametrize(("name", "several"), [("pose.yaml", False), ("results.csv", True)])
-def test_register_removes_no_file_of_others(
-    folder, register, refused, tmp_path, monkeypatch, name, several
-):
-    (tmp_path / name).write_text("of others")
-    (tmp_path / "predictions.csv").write_text("of others")
-    monkeypatch.chdir(tmp_path)
-    photos = [folder / "photos" / "0.png", *([folder / "photos" / "1.png"] if several else [])]
-    code = register(
-        *photos, folder / "truck.safetensors", *([] if several else ["--box", *box_of(0)]), out="."
-    )
-    refused(code, f"{name}: not written by this command")
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(
-        [name, "predictions.csv"], "of others"
-    )
-
-
 def test_register_overwrites_no_input(folder, register_one, register, refused, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["--camera", *CAMERA]
