@@ -21,22 +21,6 @@ mv "$SEEN.new" "$SEEN"
 """
 
 
-def wait(condition, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not (found := condition()):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    return found
-
-
-def post(address, name, content):
-    request = urllib.request.Request(
-        f"{address}upload", content, {"x-file-name": name}, method="POST"
-    )
-    with urllib.request.urlopen(request) as answer:
-        return answer.status
-
-
 @pytest.mark.slow  # tests/viewer/test_server.py ends one by SIGINT
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 @pytest.mark.parametrize(
@@ -55,7 +39,10 @@ def test_a_signal_removes_the_uploads_and_no_program_is_told_the_address(tmp_pat
         signal.signal(number, before)
     try:
         address = re.search(r"http://\S+", process.stdout.readline())[0]
-        wait(seen.is_file)
+        deadline = time.monotonic() + 60
+        while not seen.is_file():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
         (page,) = tmp_path.glob("curvireg-view-*/*.html")
         assert seen.read_text() == page.as_uri()
         assert page.stat().st_mode & 0o777 == 0o600
@@ -64,7 +51,10 @@ def test_a_signal_removes_the_uploads_and_no_program_is_told_the_address(tmp_pat
         with urllib.request.urlopen(address) as answer:
             assert answer.status == 200
         write_photo(tmp_path / "a.png", scene(0)[0])
-        assert post(address, "a.png", (tmp_path / "a.png").read_bytes()) == 204
+        content = (tmp_path / "a.png").read_bytes()
+        upload = urllib.request.Request(f"{address}upload", content, {"x-file-name": "a.png"})
+        with urllib.request.urlopen(upload) as answer:
+            assert answer.status == 204
         assert list(tmp_path.glob("curvireg-view-*/upload-*/a.png"))
         process.send_signal(number)
         process.wait(20)

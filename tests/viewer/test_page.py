@@ -22,7 +22,7 @@ from curvireg_torch.viewer.shot import Shot
 from curvireg_torch.viewer.side import Answers, CameraPanel, Inputs, Preview, Space
 from curvireg_torch.viewer.stage import Stage
 from curvireg_torch.viewer.workspace import Workspace
-from tests.viewer.test_session import write_scene
+from tests.viewer.test_session import seen, write_scene
 
 
 @pytest.fixture
@@ -38,6 +38,11 @@ def build(workspace):
     """Builds a part of the page of the workspace, which no browser shows."""
     with Client(page(""), request=None):
         yield lambda part: part(workspace)
+
+
+def refresh(*parts):
+    for part in parts:
+        asyncio.run(part.refresh())
 
 
 def send(stage, kind, x=0.0, y=0.0, **values):
@@ -56,7 +61,7 @@ def drag(stage, start, end):
 def test_gestures_come_as_fractions_and_become_a_box_in_px(workspace, build):
     shot = workspace.session.shot
     stage = build(Stage)
-    asyncio.run(stage.refresh())
+    refresh(stage)
     drag(stage, (20, 30), (120, 90))
     assert shot.box == pytest.approx((20, 30, 120, 90))
     drag(stage, (122, 60), (150, 60))  # the right edge, which is near enough
@@ -88,13 +93,9 @@ def test_typed_numbers_go_into_the_session(workspace, build):
     inputs = build(Inputs)
     session = workspace.session
 
-    def refresh():
-        asyncio.run(panel.refresh())
-        asyncio.run(inputs.refresh())
-
     def typed(matrix=None, view=None):
         asyncio.run(panel._set(1, view) if matrix is None else panel._set(4, matrix))
-        refresh()
+        refresh(panel)
         return session.options.camera
 
     def shown():
@@ -114,21 +115,21 @@ def test_typed_numbers_go_into_the_session(workspace, build):
     assert shown() == ["", "65.5"]
     assert typed(view="") is None
     asyncio.run(panel._set_camera("exif"))
-    refresh()
+    refresh(panel)
     assert panel.facts.content.endswith("has no focal length")
     assert typed("") is None
     session.options = replace(session.options, camera=(300.0, 300.0, 119.5, 0.1 + 0.2))
-    refresh()
+    refresh(panel)
     assert shown() == ["300 300 119.5 0.30000000000000004", ""], "from another window"
     asyncio.run(
         panel._set_camera(Camera([[300.0, 0, 119.5], [0, 300, 89.5], [0, 0, 1]], (0.1, 0, 0, 0)))
     )
-    refresh()
+    refresh(panel, inputs)
     assert panel.facts.content == "from a calibration file, without its distortion"
     assert inputs.command.content.startswith("None: ")
     asyncio.run(panel._set_camera("exif"))
     session.shot = Shot()
-    refresh()
+    refresh(panel, inputs)
     assert panel.facts.content.endswith("s EXIF"), "of one that is still to come"
 
 
@@ -188,7 +189,7 @@ def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(worksp
     assert click("front", 0.1, -0.9, 0.2) == (None, session.mesh_axis((0.0, -1.0, 0.0)))
     session.hint_direction((3.0, 0.0, 0.0))
     for preview in previews:
-        asyncio.run(preview.refresh())
+        refresh(preview)
         assert (
             preview.facts.content
             == "Pose prior: seen from azimuth 90, elevation 0, within 45 degrees."
@@ -207,11 +208,11 @@ def test_a_mesh_that_is_not_drawn_is_said_and_has_no_buttons(workspace, build, m
     monkeypatch.setattr(side, "MAX_VIEWER_FACES", 967)
     preview = build(Preview)
     asyncio.run(workspace.open_mesh(workspace.folder / "truck.ply"))
-    asyncio.run(preview.refresh())
+    refresh(preview)
     assert not any(element.visible for element in preview.of_scene)
     assert preview.no_prior.visible
     workspace.session.remove_limits()
-    asyncio.run(preview.refresh())
+    refresh(preview)
     assert preview.facts.content == "Meshes of more than 967 faces are not drawn."
 
 
@@ -258,22 +259,20 @@ def test_each_remark_has_its_repair(shown, monkeypatch):
 def test_the_pose_is_dragged_on_the_photograph(shown):
     shot = shown.session.shot
     posed = Stage(shown)
-    asyncio.run(posed.refresh())
+    refresh(posed)
     assert posed.mode == "pose"
     assert "disabled" in posed.undo.props
     T, K = shot.answer.pose.projection
     describer = shot.result.registrar.describer
 
     def centre():
-        T = shot.answer.pose.projection[0]
-        at = K @ (T[:3, :3] @ describer.centre + T[:3, 3])
-        return (at[:2] / at[2]).tolist()
+        return seen(shot.answer.pose.projection[0], K, describer.centre).tolist()
 
     x, y = centre()
     drag(posed, (x, y), (x + 20, y + 10))
     assert centre() == pytest.approx([x + 20, y + 10], abs=1e-6)
     assert shot.answer.pose.projection[0][:3, :3].tolist() == T[:3, :3].tolist()
-    asyncio.run(posed.refresh())
+    refresh(posed)
     assert "disabled" not in posed.undo.props
     drag(posed, (2, 2), (22, 2))  # beside the mesh: it turns
     assert (centre(), len(shot.answer.edits)) == (pytest.approx([x + 20, y + 10], abs=1e-6), 2)
@@ -286,12 +285,12 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
         send(posed, kind, **values)
     assert len(shot.answer.edits) == 1, "one change, when it rests"
     posed._last_gesture -= 10
-    asyncio.run(posed.refresh())
+    refresh(posed)
     assert len(shot.answer.edits) == 2
     send(posed, "scale", factor=1e6, roll=0.0)  # it would touch the camera
     assert posed.moved is None
     posed._set_mode("box")
-    asyncio.run(posed.refresh())
+    refresh(posed)
     assert "class='handle line'" in posed.shapes.content
 
 
@@ -301,7 +300,7 @@ def test_what_is_saved_and_drawn_is_the_answer_at_the_click(shown, monkeypatch):
     answers = Answers(shown, stage.commit)
     space = Space(shown)
     monkeypatch.setattr(ui.download, "from_url", Mock())
-    asyncio.run(stage.refresh())
+    refresh(stage)
     send(stage, "scale", factor=1.1, roll=5.0)
 
     async def click():
@@ -321,29 +320,29 @@ def test_what_is_saved_and_drawn_is_the_answer_at_the_click(shown, monkeypatch):
     assert (viewer["hypothesis"], viewer["by_hand"]) == (0, list(clicked.edits))
     assert len(clicked.edits) == 1, "the wheel was at rest for less than a moment"
     shown.session.shot = shot
-    asyncio.run(stage.refresh())
+    refresh(stage)
     send(stage, "scale", factor=1.1, roll=5.0)
     shot.choose(0)
     stage._last_gesture -= 10
-    asyncio.run(stage.refresh())
+    refresh(stage)
     assert shot.answer.edits == (), "what was moved was another answer"
 
 
 def test_photographs_are_chosen_from_a_strip(shown, registered):
     session = shown.session
     stage = Stage(shown)
-    asyncio.run(stage.refresh())
+    refresh(stage)
     assert stage.strip.default_slot.children == []
     first = session.shot
     second = session.open_photo(registered[1] / "photo.png")
-    asyncio.run(stage.refresh())
+    refresh(stage)
     assert (stage.mode, stage.layers.visible) == ("box", False)
     one, other = stage.strip.default_slot.children
     assert (one.props["aria-pressed"], other.props["aria-pressed"]) == ("false", "true")
     assert ("done" in one.classes, "done" in other.classes) == (True, False)
     drag(stage, (20, 30), (120, 90))
     stage._select(first)
-    asyncio.run(stage.refresh())
+    refresh(stage)
     assert (session.shot, stage.mode, stage.layers.visible) == (first, "pose", True)
     assert second.box == pytest.approx((20, 30, 120, 90))
     T = first.answer.pose.projection[0]
@@ -359,5 +358,5 @@ def test_photographs_are_chosen_from_a_strip(shown, registered):
     asyncio.run(shown.remove_photo())
     stage._select(second)
     assert session.shot is first, "the other one is closed"
-    asyncio.run(stage.refresh())
+    refresh(stage)
     assert stage.strip.default_slot.children == []
