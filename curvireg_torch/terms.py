@@ -264,18 +264,16 @@ class Correlation(Term):
         def normalized(descriptors: Tensor) -> Tensor:
             return F.normalize(descriptors if whitening is None else whitening(descriptors), dim=1)
 
-        described = views.precision if self.whitening == "paper" else normalized
         known = views.descriptors
         if self.whitening == "paper":
+            described = views.precision
             known = known - views.precision.mean
-        elif whitening is not None:
-            known = whitening(known)
-        # A normalised copy takes as much memory as all descriptors.
-        lengths = (
-            known.new_ones(len(known))
-            if self.whitening == "paper"
-            else torch.linalg.vector_norm(known, dim=1).clamp(min=LEAST_LENGTH)
-        )
+            lengths = known.new_ones(len(known))
+        else:
+            described = normalized
+            known = known if whitening is None else whitening(known)
+            # A normalised copy takes as much memory as all descriptors.
+            lengths = torch.linalg.vector_norm(known, dim=1).clamp(min=LEAST_LENGTH)
 
         def compare(query: QueryFeatures) -> Tensor:
             B, K = query.descriptors.shape[:2]
