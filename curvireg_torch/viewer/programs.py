@@ -41,9 +41,7 @@ def python_program(shot: Shot, name: Callable[[Path], str]) -> str:
         )
         photos = list(map(read.format, photos))
     of_mesh = _given(unit=request.unit, up=request.up)
-    chosen = {name: getattr(request, name) for name in ("renderer", "device")}
-    chosen = {name: value for name, value in chosen.items() if value != _DEFAULTS[name]}
-    of_registrar = _given(mesh_is=request.mesh_is, **chosen)
+    of_registrar = _given(mesh_is=request.mesh_is, renderer=request.renderer, device=request.device)
     if pipeline := _pipeline(request):
         of_registrar = f", pipeline={pipeline}{of_registrar}"
     of_parts = _given(
@@ -83,8 +81,10 @@ def python_program(shot: Shot, name: Callable[[Path], str]) -> str:
 
 
 def _given(**values: Any) -> str:
-    """Arguments of a call without those that are not given."""
-    return "".join(f", {name}={value!r}" for name, value in values.items() if value is not None)
+    """Arguments of a call without those that have their defaults."""
+    return "".join(
+        f", {name}={value!r}" for name, value in values.items() if value != _DEFAULTS[name]
+    )
 
 
 def _pipeline(request: RegisterOptions) -> str:
