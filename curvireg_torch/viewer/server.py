@@ -30,7 +30,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ..errors import MAX_MESH_BYTES, InvalidInputError, OutputError
 from ..jobs.options import RegisterOptions
 from ..utils.files import file_name, hangup_signals, signals_handled, terminable
-from ..utils.threads import one_torch_thread
 from .page import build_page
 from .workspace import Workspace, show_warning
 
@@ -69,7 +68,7 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
         _add_page(workspace)
         server = make_server(listener, host, browser_folder=Path(folder) if browser else None)
         hangup = signals_handled(hangup_signals(), server.handle_exit)  # uvicorn handles the others
-        with one_torch_thread(), warnings.catch_warnings(), hangup:
+        with warnings.catch_warnings(), hangup:
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = show_warning
             with suppress(KeyboardInterrupt):  # uvicorn raises it again once the server has ended
@@ -189,14 +188,13 @@ def guarded(site: ASGIApp, *hosts: str) -> ASGIApp:
                 MutableHeaders(scope=message).update(SECURITY_HEADERS)
             await send(message)
 
-        headers = Headers(scope=scope) if scope["type"] != "lifespan" else Headers()
+        if scope["type"] == "lifespan":
+            await site(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
         own = headers.get("host", "").lower()
         named = _HOST.fullmatch(own)
-        is_known = (
-            scope["type"] == "lifespan"
-            or is_open
-            or (named is not None and _plain_host(named[1]) in names)
-        )
+        is_known = is_open or (named is not None and _plain_host(named[1]) in names)
         answer = site
         if any(origin.partition("://")[2].lower() != own for origin in headers.getlist("origin")):
             answer = PlainTextResponse("requests of other sites are refused", status_code=403)
