@@ -29,6 +29,7 @@ from .shot import Answer, Numbers, Shot, numbers
 from .widgets import (
     Panel,
     button,
+    copy_button,
     fact_line,
     field,
     file_chooser,
@@ -122,13 +123,7 @@ class Answers(Panel):
                             f"download-{name}",
                             "quiet",
                         )
-                    text(
-                        "button",
-                        "copy as Python",
-                        "button quiet",
-                        type="button",
-                        data_copy="python",
-                    )
+                    copy_button("copy as Python", "python")
                 self.camera = text("p", "", "camera", data_testid="used-camera")
                 self.meaning = text("p", "", "facts")
                 self.repairs = region("div", "row", data_testid="repairs")
@@ -145,9 +140,12 @@ class Answers(Panel):
         self.commit()
         name, media_type = DOWNLOADS[kind]
         shot = self.session.shot.snapshot()  # others may be shown before the job runs
-        document = {"result.json": lambda: to_json(shot.document()).encode()}
-        make = {"picture": shot.overlay, "pose.glb": shot.glb, **document}[kind]
-        if content := await self.workspace.run("pose", make):
+        makers = {
+            "picture": shot.overlay,
+            "result.json": lambda: to_json(shot.document()).encode(),
+            "pose.glb": shot.glb,
+        }
+        if content := await self.workspace.run("pose", makers[kind]):
             ui.download.from_url(f"./{self.workspace.serve(name, content, media_type)}", name)
 
     async def refresh(self) -> None:
@@ -296,7 +294,7 @@ class Inputs(Panel):
 
     def _copied(self, name: str) -> Any:
         element = text("pre", "", data_testid=name)
-        text("button", "Copy", "button quiet", type="button", data_copy=name)
+        copy_button("Copy", name)
         return element
 
     def _select(self, name: str, label: str, choices: dict[str | None, str]) -> None:

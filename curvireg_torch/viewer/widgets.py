@@ -75,6 +75,11 @@ def button(
     return element.on("click", lambda: on_click())
 
 
+def copy_button(label: str, test_id: str) -> None:
+    """A button that copies the text of an element; ``page.js`` does it."""
+    text("button", label, "button quiet", type="button", data_copy=test_id)
+
+
 def fold(title: str, test_id: str, *, is_open: bool = False) -> Any:
     """A part that can be folded away; what is built inside is added to it."""
     part = region("details", "fold", data_testid=f"fold-{test_id}").props("open" if is_open else "")
