@@ -72,10 +72,11 @@ class Browser:
     def script(self, code, *arguments):
         return self.driver.execute_script(code, *arguments)
 
-    def mouse(self):
+    def mouse(self, duration=250):
+        """What the mouse does, each move in so many milliseconds."""
         from selenium.webdriver import ActionChains
 
-        return ActionChains(self.driver)
+        return ActionChains(self.driver, duration)
 
     def text(self, name):
         return self.part(name).get_attribute("value") or self.part(name).text
@@ -116,6 +117,14 @@ class Browser:
         button = self.part(name)
         self.script("arguments[0].scrollIntoView({block: 'center'})", button)
         self.wait(lambda: button.click() or True, f"click {name}", 20)
+
+    def choose(self, name):
+        self.click(name)
+        self.wait(lambda: self.is_pressed(name), f"{name} is chosen")
+
+    def register(self):
+        self.click("register")
+        self.shows("progress", "done")
 
     def unfold(self, name):
         self.script("arguments[0].open = true", self.part(f"fold-{name}"))
@@ -180,8 +189,6 @@ class Browser:
     def drag(self, start, end, size, held=None):
         """Drag the mouse between pixels of the photograph, whose width is ``size`` px; call
         ``held`` before the end."""
-        from selenium.webdriver import ActionChains
-
         image = self.part("photograph")
         self.script("arguments[0].scrollIntoView({block: 'center'})", image)
         zoom = image.size["width"] / size
@@ -190,16 +197,12 @@ class Browser:
             tuple(round((v + 0.5) * zoom - m) for v, m in zip(point, middle, strict=True))
             for point in (start, end)
         )
-        chain = (
-            ActionChains(self.driver, duration=50)
-            .move_to_element_with_offset(image, x0, y0)
-            .click_and_hold()
-        )
+        chain = self.mouse(50).move_to_element_with_offset(image, x0, y0).click_and_hold()
         chain.move_by_offset((x1 - x0) // 2, (y1 - y0) // 2)
         chain.move_to_element_with_offset(image, x1, y1).perform()
         if held is not None:
             held()
-        ActionChains(self.driver, duration=50).release().perform()
+        self.mouse(50).release().perform()
 
     def extent(self, width):
         """Box of the mesh that is drawn over the photograph, which is ``width`` px wide."""

@@ -112,6 +112,13 @@ def session(registered):
 
 
 @pytest.fixture
+def scene(tmp_path):
+    """A folder with a scene."""
+    write_scene(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def workspace(tmp_path):
     (tmp_path / "uploads").mkdir()
     return Workspace(RegisterOptions(), tmp_path / "uploads")

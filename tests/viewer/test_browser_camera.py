@@ -64,6 +64,5 @@ def test_the_camera_that_is_typed_is_the_camera_that_is_used(browser, folder):
     browser.part("fov").send_keys("\n")
     browser.contains("command", "--fov", 0)
     browser.part("camera").send_keys("260 260 119,5 89,5")
-    browser.click("register")  # at once
-    browser.shows("progress", "done")
+    browser.register()  # at once
     assert browser.text("used-camera") == "camera: 260 260 119.5 89.5 px, as given"

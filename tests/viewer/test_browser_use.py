@@ -57,6 +57,12 @@ def hinted_azimuth(browser):
     return float(re.search(r"azimuth ([\d.]+)", browser.text("prior-facts"))[1])
 
 
+def turn(browser, canvas, dx, dy):
+    """Drag from the middle of a scene."""
+    drag = browser.mouse().move_to_element(canvas).click_and_hold().move_by_offset(dx, dy)
+    drag.release().perform()
+
+
 def test_the_model_turned_with_the_mouse_is_a_hint(browser):
     browser.emulate(1440, 900)
     browser.unfold("command-line")
@@ -67,13 +73,9 @@ def test_the_model_turned_with_the_mouse_is_a_hint(browser):
     browser.wait(lambda: {"up", "front"} <= set(browser.script(labels)), "axes")
     before = hinted_azimuth(browser)
     assert f"--near {before:g} " in browser.text("command")
-    browser.mouse().move_to_element(canvas).click_and_hold().move_by_offset(
-        45, 0
-    ).release().perform()
+    turn(browser, canvas, 45, 0)
     browser.wait(lambda: 20 < (before - hinted_azimuth(browser)) % 360 < 120, "turned")
-    browser.mouse().move_to_element(canvas).click_and_hold().move_by_offset(
-        -45, 20
-    ).release().perform()
+    turn(browser, canvas, -45, 20)
     browser.wait(
         lambda: abs(before - hinted_azimuth(browser)) < 20, "turned back, and seen from higher up"
     )
@@ -102,8 +104,7 @@ def test_a_search_can_be_stopped_and_started_again(browser):
     browser.click("register")
     browser.wait(lambda: browser.messages() == ["stopped"], "stopped")
     browser.wait(lambda: not browser.part("stop").is_displayed(), "nothing to stop")
-    browser.click("register")
-    browser.shows("progress", "done")
+    browser.register()
     assert browser.messages() == []
     seconds = [text for text in browser.script("return window.shown") if text]
     assert seconds.count("0 s") > 1, "of both searches"
@@ -130,8 +131,7 @@ def test_the_card_that_is_clicked_is_the_answer_that_is_shown_and_saved(browser)
     browser.unfold("command-line")
     first = saved(browser)
     assert first["viewer"]["command"] == browser.text("command")
-    browser.click("answer-2")
-    browser.wait(lambda: browser.is_pressed("answer-2"), "chosen")
+    browser.choose("answer-2")
     assert not browser.is_pressed("answer-1")
     second = saved(browser)
     assert second["rotation"] == first["hypotheses"][1]["rotation"] != first["rotation"]
@@ -139,8 +139,7 @@ def test_the_card_that_is_clicked_is_the_answer_that_is_shown_and_saved(browser)
         browser.click(f"download-{name.replace('overlay.png', 'picture')}")
         assert browser.downloaded(name).startswith(start)
     assert browser.text("verdict") == "your choice"
-    browser.click("answer-1")
-    browser.wait(lambda: browser.is_pressed("answer-1"), "the first again")
+    browser.choose("answer-1")
     assert browser.text("used-camera").endswith(": the camera is known by its field of view")
 
 
@@ -207,18 +206,15 @@ def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(brow
     canvas = browser.canvas("preview")
     start = hinted_azimuth(browser)
     browser.script("arguments[0].scrollIntoView({block: 'center'})", canvas)
-    drag = browser.mouse().move_to_element(canvas).click_and_hold().move_by_offset(120, 0)
-    drag.release().perform()  # half the height is half a turn
+    turn(browser, canvas, 120, 0)  # half the height is half a turn
     browser.wait(lambda: 140 < (start - hinted_azimuth(browser)) % 360 < 220, "seen from behind")
-    browser.click("register")
-    browser.shows("progress", "done")
+    browser.register()
     browser.wait(lambda: browser.part("turn-the-prior-around"), "repair")
     assert browser.text("verdict") != "reliable"
     browser.click("turn-the-prior-around")
     browser.shows("verdict", "reliable")
     browser.click("no-prior")
-    browser.click("register")
-    browser.shows("progress", "done")
+    browser.register()
     browser.shows("certainty", before)
     assert browser.messages() == []
 
@@ -382,8 +378,7 @@ def test_each_of_several_photographs_keeps_its_box(browser, folder):
         )
 
     for left in range(len(thumbnails) - 1, 1, -1):  # those of the tests before
-        browser.click("photograph-1")
-        browser.wait(lambda: browser.is_pressed("photograph-1"), "the first")
+        browser.choose("photograph-1")
         browser.click("no-photo")
         browser.wait(lambda n=left: len(browser.images("strip")) == n, f"{left} left")
     browser.click("photograph-2")
@@ -403,8 +398,7 @@ def test_an_answer_is_zoomed_to_and_the_pointer_shows_what_a_drag_does(browser, 
     browser.wait(lambda: browser.images("photograph")[0].size["width"] > 100, "shown")
     browser.drag((102, 70), (156, 147), 240)
     browser.wait(lambda: browser.box() is not None, "box")
-    browser.click("register")
-    browser.shows("progress", "done")
+    browser.register()
     browser.wait(lambda: canvas.get_attribute("data-object"), "its extent")
 
     def extent():
@@ -483,8 +477,7 @@ def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
     browser.shows("rig-facts", "rig.csv: one pose in 2 photographs")
     browser.begins("mesh-facts", "table.ply: ")
     assert browser.text("register") == "Find the pose in 2 photographs"
-    browser.click("register")
-    browser.shows("progress", "done")
+    browser.register()
     for number, scene in enumerate(scenes, start=1):
         browser.click(f"photograph-{number}")
         box = pytest.approx(scene.box.tolist(), abs=4)

@@ -11,14 +11,11 @@ from curvireg_torch.errors import CurviregError
 from curvireg_torch.inspection.facts import mesh_facts
 from curvireg_torch.viewer import examination as module
 from tests._support import refused
-from tests.viewer.test_session import write_scene
 
 
-@pytest.fixture
-def scene(tmp_path, monkeypatch):
+@pytest.fixture(autouse=True)
+def _few_views(monkeypatch):
     monkeypatch.setattr("curvireg_torch.inspection.look_alikes.LOOKED_AT", 12)
-    write_scene(tmp_path)
-    return tmp_path
 
 
 def with_small_bank(workspace, folder):

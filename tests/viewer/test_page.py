@@ -22,14 +22,13 @@ from curvireg_torch.viewer.shot import Shot
 from curvireg_torch.viewer.side import Answers, CameraPanel, Inputs, Preview, Space
 from curvireg_torch.viewer.stage import Stage
 from curvireg_torch.viewer.workspace import Workspace
-from tests.viewer.test_session import seen, write_scene
+from tests.viewer.test_session import seen
 
 
 @pytest.fixture
-def workspace(tmp_path):
-    write_scene(tmp_path)
-    workspace = Workspace(RegisterOptions(limits={"front": "-x", "theta": (-10.0, 10.0)}), tmp_path)
-    asyncio.run(workspace.open_photo(tmp_path / "photo.png"))  # 240 x 180 px
+def workspace(scene):
+    workspace = Workspace(RegisterOptions(limits={"front": "-x", "theta": (-10.0, 10.0)}), scene)
+    asyncio.run(workspace.open_photo(scene / "photo.png"))  # 240 x 180 px
     return workspace
 
 

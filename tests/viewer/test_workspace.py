@@ -28,13 +28,6 @@ from curvireg_torch.viewer.workspace import show_warning, unpack
 from curvireg_torch.visualization.encoding import png
 from tests._support import refused
 from tests._support.calibrations import calibration
-from tests.viewer.test_session import write_scene
-
-
-@pytest.fixture
-def scene(tmp_path):
-    write_scene(tmp_path)
-    return tmp_path
 
 
 async def upload(workspace, path, name=None, content=None, is_first=True):
