@@ -30,37 +30,38 @@ def test_correlation_is_the_cosine_of_the_better_crop_scored_by_standard_deviati
     assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
 
 
-def test_matcher_ranks_by_whitened_correlation(bank):
-    images = [scene(0)[0]]
-    boxes = scene(0)[1][None]
-    pipeline = replace(bank.pipeline.with_term("hog", whitening="bank"), box_jitter=0.0)
+def ranked(bank, whitening):
+    """A matcher, a photograph that it has described, and its ranking."""
+    image, box, _ = scene(0)
+    pipeline = replace(bank.pipeline.with_term("hog", whitening=whitening), box_jitter=0.0)
     matcher = ViewMatcher(bank, pipeline=pipeline)
-    query = matcher.query(images, boxes).descriptors[:, 0]
+    query = matcher.query([image], box[None])
+    return matcher, query, matcher.rank(query)
+
+
+def test_matcher_ranks_by_whitened_correlation(bank):
+    _, query, ranking = ranked(bank, "bank")
     mean, covariance = ledoit_wolf(bank.descriptors)
     factor = torch.linalg.cholesky(covariance.double())
-    a, b = (torch.linalg.solve(factor, (x - mean).double().T).T for x in (query, bank.descriptors))
+    both = query.descriptors[:, 0], bank.descriptors
+    a, b = (torch.linalg.solve(factor, (x - mean).double().T).T for x in both)
     expected = F.cosine_similarity(a[:, None], b[None], dim=2).float()
-    assert_close(matcher(images, boxes).hog, expected, atol=1e-4, rtol=1e-3)
+    assert_close(ranking.hog, expected, atol=1e-4, rtol=1e-3)
 
 
 def test_matcher_ranks_by_the_product_that_the_paper_prints(bank):
-    images = [scene(0)[0]]
-    boxes = scene(0)[1][None]
-    pipeline = replace(bank.pipeline.with_term("hog", whitening="paper"), box_jitter=0.0)
-    matcher = ViewMatcher(bank, pipeline=pipeline)
-    query = matcher.query(images, boxes)
+    matcher, query, ranking = ranked(bank, "paper")
     mean, covariance = ledoit_wolf(bank.descriptors)
     solved = torch.linalg.solve(covariance.double(), query.descriptors[0].T.double())
     expected = ((bank.descriptors - mean).double() @ solved).T.float()
-    found = matcher(images, boxes).hog
-    assert_close(found, expected, atol=2e-3 * float(expected.abs().max()), rtol=0)
+    assert_close(ranking.hog, expected, atol=2e-3 * float(expected.abs().max()), rtol=0)
     # Further views are compared by the bank's mean and covariance.
     few = bank.views[10:14]
     score = terms.Correlation(whitening="paper").log_score(expected[:, 10:14])
-    rep = matcher.pipeline.terms[1]
-    score = score + rep.log_score(matcher(images, boxes).repeatability[:, 10:14])
-    shape = next(term for term in matcher.pipeline.terms if term.name == "box")
-    score = (score + shape.log_score(matcher(images, boxes).terms["box"][:, 10:14]))[0]
+    for term in matcher.pipeline.terms:
+        if term.name in ("repeatability", "box"):
+            score = score + term.log_score(ranking.terms[term.name][:, 10:14])
+    score = score[0]
     difference = matcher.compare_views(query, few) - (score - score.max())
     assert_close(difference - difference.mean(), torch.zeros(4), rtol=0, atol=0.05)
 
