@@ -1,16 +1,14 @@
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests._support.new_process import run_python
+
 
 def run(code, environment=None):
     """What a program prints that ends without an error."""
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
-    )
+    done = run_python(code, env=environment)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
 
