@@ -64,7 +64,7 @@ class Session:
     """
 
     options: RegisterOptions
-    folder: Path | None = None
+    folder: Path
     shots: list[Shot] = field(default_factory=list)
     shot: Shot = field(default_factory=Shot)
     removed: tuple[int, Shot] | None = None
@@ -100,8 +100,6 @@ class Session:
     def without_folders(self, text: str) -> str:
         """A text in which uploaded files, and those unpacked from an archive, have their names
         alone."""
-        if self.folder is None:
-            return text
         folders = {str(self.folder), str(self.folder.resolve())}
         places = "|".join(map(re.escape, sorted(folders, key=len, reverse=True)))
         return re.sub(rf"(?:{places})[/\\](?:upload-\w+[/\\]?)?(?:{UNPACKED}[/\\])?", "", text)
