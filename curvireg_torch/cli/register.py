@@ -59,9 +59,8 @@ def add_register(commands: Any) -> None:
         "curvireg register --list LIST [MESH] --out DIR [options]\n       "
         "curvireg register --views RIG MESH --out DIR [options]",
         description="One photograph: writes DIR/result.json, DIR/overlay.png and "
-        "DIR/pose.glb.\nSeveral, or a list: "
-        "DIR/results.csv, DIR/results.jsonl and DIR/index.html;\nafter an interruption the same "
-        "command resumes.",
+        "DIR/pose.glb.\nSeveral, or a list: DIR/results.csv, DIR/results.jsonl and "
+        "DIR/index.html;\nafter an interruption the same command resumes.",
         run=run,
     )
     add = parser.add_argument
@@ -81,21 +80,18 @@ def add_register(commands: Any) -> None:
         "--list",
         "LIST",
         help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and "
-        "azimuth,side,... (see below: what "
-        "is known about the pose). Paths are relative to the list's folder. Empty cells mean: "
-        "detect the object, "
-        "EXIF or an estimated camera, MESH, what the options say",
+        "azimuth,side,... (see below: what is known about the pose). Paths are relative to the "
+        "list's folder. Empty cells mean: detect the object, EXIF or an estimated camera, MESH, "
+        "what the options say",
     )
     add_path(
         parser,
         "--views",
         "RIG",
         help="photographs of one pose from cameras with known poses: CSV with columns "
-        "photo,x0,y0,x1,y1 (box may be "
-        "empty), fx,fy,cx,cy or camera (a file), r11..r33 or qw,qx,qy,qz and tx,ty,tz (camera "
-        "from world, in the "
-        "mesh's unit); a folder of COLMAP with images.txt and cameras.txt; or the folder of a BOP "
-        "scene with cam_R_w2c",
+        "photo,x0,y0,x1,y1 (box may be empty), fx,fy,cx,cy or camera (a file), r11..r33 or "
+        "qw,qx,qy,qz and tx,ty,tz (camera from world, in the mesh's unit); a folder of COLMAP with "
+        "images.txt and cameras.txt; or the folder of a BOP scene with cam_R_w2c",
     )
     add(
         "--every",

@@ -38,8 +38,7 @@ MAX_ARCHIVE_DEPTH = 32  # folders around a file in a zip archive
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 RIG_PARTS = ("cameras.txt", "scene_gt.json", "scene_gt_info.json")
 SAMPLE_CREDIT = (
-    "photograph by Rachel Michetti, courtesy of Pikolo Espresso Bar (CC0); the mesh "
-    "was modelled "
+    "photograph by Rachel Michetti, courtesy of Pikolo Espresso Bar (CC0); the mesh was modelled "
     "after it"
 )
 SAMPLE_BOX = (172.0, 18.0, 409.0, 308.0)  # of the cup, in px
