@@ -69,20 +69,16 @@ def build_page(workspace: Workspace) -> None:
             inputs = Inputs(workspace)
 
     async def refresh() -> None:
-        workspace.examination.start_if_due(searching=workspace.searching)
-        steps.refresh()
-        for part in (camera, inputs, stage, answers, space, preview):
-            await part.refresh()
-
-    async def refresh_safely() -> None:
         try:
-            await refresh()
+            workspace.examination.start_if_due(searching=workspace.searching)
+            steps.refresh()
+            for part in (camera, inputs, stage, answers, space, preview):
+                await part.refresh()
         except CurviregError as error:  # else all that comes after it would stand still
-            workspace.messages["page"] = session.without_folders(str(error))
+            workspace.messages["page"] = workspace.session.without_folders(str(error))
             steps.show_messages()
 
-    session = workspace.session
-    ui.timer(TICK_SECONDS, refresh_safely)
+    ui.timer(TICK_SECONDS, refresh)
 
 
 class Steps(Panel):
