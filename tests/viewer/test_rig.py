@@ -53,13 +53,17 @@ def search(workspace):
     assert workspace.messages == {}
 
 
-def test_a_photograph_is_read_again_only_where_distortion_was_removed(workspace, rig, monkeypatch):
+def test_without_the_rig_a_photograph_is_alone_and_read_again_if_distortion_was_removed(
+    workspace, rig, monkeypatch
+):
     read = Mock(wraps=session_module.read_photo)
     monkeypatch.setattr(session_module, "read_photo", read)
     session = send(workspace, rig[0], "0.png", "1.png", "rig.csv")
-    assert all(shot.view is not None for shot in session.shots)
     assert read.call_count == 2
+    assert session.together() == session.shots
     asyncio.run(workspace.open_rig(None))
+    assert ([shot.view for shot in session.shots], len(session.together())) == ([None, None], 1)
+    assert not list(workspace.folder.rglob("rig.csv"))
     assert read.call_count == 2
     image = session.shots[0].image
     session.set_camera(Camera(torch.eye(3), (0.1, 0.0, 0.0, 0.0)))
@@ -175,17 +179,6 @@ def test_boxes_that_are_drawn_replace_those_of_the_rig(found, loose):
     with refused("a pose prior: photographs of a rig take none"):
         session.register()
     session.remove_limits()
-
-
-def test_without_the_rig_photographs_are_registered_alone_again(workspace, rig):
-    session = send(workspace, rig[0], "0.png", "rig.csv", "1.png")
-    assert len(session.together()) == 2
-    asyncio.run(workspace.open_rig(None))
-    assert ([shot.view for shot in session.shots], len(session.together())) == ([None, None], 1)
-    assert not list(workspace.folder.rglob("rig.csv"))
-    session.shots[0].set_box((1.0, 2.0, 30.0, 40.0))
-    session.shot = session.shots[0]
-    assert session.request().box == (1.0, 2.0, 30.0, 40.0)
 
 
 def test_a_calibration_that_comes_while_its_rig_goes_is_that_of_the_photographs(
