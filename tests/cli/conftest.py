@@ -30,15 +30,13 @@ def drawn():
 
 @pytest.fixture
 def refused(capsys):
-    """Check that a command was refused with code 2 and one line that contains these texts; returns
-    the line."""
+    """Check that a command was refused with code 2 and one line that contains these texts."""
 
     def check(code, *messages):
         (error,) = capsys.readouterr().err.splitlines()
         assert code == 2
         for message in messages:
             assert message in error
-        return error
 
     return check
 
@@ -48,11 +46,11 @@ def register_one(folder, tmp_path):
     """Run ``curvireg register`` on one photograph, by default with its box; results go to
     ``tmp_path / "out"``."""
 
-    def run(*words, photo="photos/0.png", mesh="truck.safetensors", box=None, out="out"):
+    def run(*words, photo="photos/0.png", mesh="truck.safetensors", box=None):
         box = box_of(0) if box is None else box
         boxes = ["--box", *box] if box else []
         command = ["register", folder / photo, folder / mesh, *boxes, *words]
-        return main([*map(str, command), "--out", str(tmp_path / out), "--quiet"])
+        return main([*map(str, command), "--out", str(tmp_path / "out"), "--quiet"])
 
     return run
 

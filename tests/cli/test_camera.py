@@ -83,24 +83,17 @@ def test_without_a_camera_the_focal_length_is_estimated(register_photo):
     assert camera["matrix"][0][0] == pytest.approx(260.0, rel=3 * camera["focal_deviation"])
     assert "camera: focal length estimated" in printed
     assert "the distance is proportional to it" in printed
-    similar, _ = register_photo("photos/0.png", "--mesh-is", "similar")
-    assert similar["translation"] is similar["camera"] is similar["camera_source"] is None
 
 
 def test_guesses_apply_to_rows_without_a_camera(folder, register, tmp_path):
     rows = [["exif.png", *CAMERA], ["exif.png", *[""] * 4], ["photos/0.png", *[""] * 4]]
     rows = [[*row, *box_of(0)] for row in rows]
     path = written(folder / "cameras.csv", "photo,fx,fy,cx,cy,x0,y0,x1,y1", *rows)
-    words = ["--list", path, folder / "truck.safetensors"]
-    assert register(*words, "--camera", "exif") == 0
+    assert register("--list", path, folder / "truck.safetensors", "--camera", "exif") == 0
     known, guessed, failed = lines(tmp_path / "out")
     assert [line["inputs"]["camera_source"] for line in (known, guessed)] == ["given", "exif"]
     assert guessed["translation"] is not None
     assert "no focal length" in failed["message"]
-    # Another guess is another request.
-    assert register(*words, "--fov", "50") == 0
-    sources = [line["inputs"]["camera_source"] for line in lines(tmp_path / "out")]
-    assert sources == ["given", "fov", "fov"]
 
 
 @pytest.fixture(scope="module")
@@ -171,8 +164,6 @@ def test_lists_take_calibration_files_and_masks(folder, lens, tmp_path):
 def test_strict_tells_by_the_exit_code_whether_what_is_needed_is_reliable(
     folder, register_one, register, tmp_path, monkeypatch
 ):
-    verdicts = []
-    monkeypatch.setattr(Registration, "verdict", property(lambda _: verdicts[-1]))
     words = ["--camera", *CAMERA, "--no-refine"]
     for verdict, need, code in (
         ("reliable", [], 0),
@@ -182,7 +173,7 @@ def test_strict_tells_by_the_exit_code_whether_what_is_needed_is_reliable(
         ("reliable", ["--need", "axis"], 0),
         ("unsure", ["--need", "axis"], NONE_RELIABLE),
     ):
-        verdicts.append(verdict)
+        monkeypatch.setattr(Registration, "verdict", verdict)
         assert register_one(*words, "--strict", *need) == code
     with pytest.raises(SystemExit):  # without --strict
         register_one(*words, "--need", "axis")
@@ -194,7 +185,7 @@ def test_strict_tells_by_the_exit_code_whether_what_is_needed_is_reliable(
     ):
         rows = [[folder / "photos" / name, *box_of(0), *CAMERA] for name in names]
         written(listed, "photo,x0,y0,x1,y1,fx,fy,cx,cy", *rows)
-        verdicts.append(verdict)
+        monkeypatch.setattr(Registration, "verdict", verdict)
         assert register(*words, out=verdict) == code
 
 

@@ -4,8 +4,6 @@ scripts/robustness/wrong_inputs.txt."""
 import gc
 import json
 import shlex
-import subprocess
-import sys
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -25,6 +23,7 @@ from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import DEFAULT, PRESETS, ViewPolicy
 from scripts.robustness.wrong_inputs import cases
 from tests._support import double, slow_after, truck_bank
+from tests._support.new_process import run_python
 from tests._support.small import SMALL
 from tests.viewer.test_session import write_scene
 
@@ -58,9 +57,7 @@ def run():
 __main__.run = run
 sys.exit(__main__.start())
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
+    done = run_python(code)
     assert done.stderr == ""
     return done.returncode, done.stdout.split("\n")[:-1]
 
@@ -92,7 +89,8 @@ def test_cache_names_meshes_and_clears_banks(folder, capsys, tmp_path, monkeypat
         PRESETS["fast"], views=ViewPolicy(pose="upright", azimuth_step=180.0, elevations=(10.0,))
     )
     cached_bank(load_mesh(folder / "truck.ply"), pipeline=pipeline, progress=False)
-    (tmp_path / "banks" / f"bank-{'0' * 32}.safetensors").write_bytes(b"cut")
+    damaged = tmp_path / "banks" / f"bank-{'0' * 32}.safetensors"
+    damaged.write_bytes(b"cut")
     assert main(["cache"]) == 0
     listed = capsys.readouterr().out
     assert listed.count("truck.ply") == 1
@@ -101,7 +99,7 @@ def test_cache_names_meshes_and_clears_banks(folder, capsys, tmp_path, monkeypat
     assert main(["cache", "list"]) == 0
     assert capsys.readouterr().out == listed
     for words in (["--clear"], ["clear"]):
-        (tmp_path / "banks" / f"bank-{'0' * 32}.safetensors").write_bytes(b"cut")
+        damaged.write_bytes(b"cut")
         assert main(["cache", *words]) == 0
         assert list((tmp_path / "banks").iterdir()) == []
 

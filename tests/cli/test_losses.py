@@ -8,7 +8,8 @@ from curvireg_torch.cli import main
 from curvireg_torch.formats.exports.ros import FILES
 from curvireg_torch.jobs.outputs import MARKER, output_folder
 from tests._support import scene, slow_after, write_video
-from tests._support.lists import CAMERA, box_of, lines, table, written
+from tests._support.lists import CAMERA, box_of, check_pose, table, written
+from tests._support.tables import text_table
 
 SOURCES = [
     ("left/shot.png", "right/shot.png"),
@@ -33,12 +34,7 @@ def test_sources_of_one_name_keep_their_own_results(folder, register, tmp_path, 
     frame = "" if first.endswith("png") else ":000000"
     assert [row["photo"] for row in rows] == [f"{source}{frame}" for source in sources]
     assert rows[0]["r11"] != rows[1]["r11"]
-    together = lines(tmp_path / "out")
-    for number, source in enumerate(sources if frame else []):  # one photograph is no list
-        assert register(source, *words, out=str(number)) == 0
-        (alone,) = lines(tmp_path / str(number))
-        for name in ("rotation", "score"):
-            assert alone[name] == together[number][name]
+    check_pose(rows[0], scene(0)[2], 15.0, 1.0)
     assert register(*sources[::-1], *words) == 0
     assert [row["r11"] for row in table(tmp_path / "out")] == [row["r11"] for row in rows[::-1]]
 
@@ -117,41 +113,34 @@ def test_a_photograph_that_fails_leaves_no_result_of_another(register_one, tmp_p
     assert {path.name for path in out.iterdir()} == {MARKER}
 
 
-WRONG = {
-    "register": "--pipeline --start --boxes --camera --field",
-    "register several": "--pipeline --boxes",
-    "follow": "--pipeline --start --boxes --field",
-    "inspect": "--pipeline",
-    "demo": "--pipeline",
-}
+MISTAKES = text_table("""
+register         |              | photos/0.png truck.safetensors              | --pipeline --start
+register         |              | photos/0.png truck.safetensors              | --boxes --camera
+register         |              | photos/0.png truck.safetensors              | --field
+register several | results.csv  | photos/0.png photos/1.png truck.safetensors | --pipeline --boxes
+follow           | results.csv  | photos truck.safetensors                    | --pipeline --start
+follow           | results.csv  | photos truck.safetensors                    | --boxes --field
+inspect          | inspect.json | truck.ply                                   | --pipeline
+demo             | result.json  |                                             | --pipeline
+""")
+"""Commands, a result that stays, files, and options that name a file which does not exist."""
 
 
 @pytest.mark.parametrize(
-    ("command", "option"),
-    [(command, option) for command, some in WRONG.items() for option in some.split()],
+    ("command", "name", "files", "option"),
+    [(*case, option) for *case, some in MISTAKES for option in some.split()],
 )
 def test_a_mistake_in_an_option_makes_and_empties_no_folder(
-    folder, refused, tmp_path, command, option
+    folder, refused, tmp_path, monkeypatch, command, name, files, option
 ):
-    mesh = [folder / "truck.safetensors"]
-    photos = [folder / "photos" / f"{seed}.png" for seed in (0, 1)]
-    given = {
-        "register": ["register", *photos[:1], *mesh],
-        "register several": ["register", *photos, *mesh],
-        "follow": ["follow", folder / "photos", *mesh],
-        "inspect": ["inspect", folder / "truck.ply"],
-        "demo": ["demo"],
-    }
+    monkeypatch.chdir(folder)
     camera = ["--camera", *CAMERA] if option in ("--start", "--boxes") else []
     out = tmp_path / "out"
-    words = [*given[command], *camera, option, tmp_path / "none.json", "--out", out, "--quiet"]
-    refused(main([*map(str, words)]), "none.json")
+    words = [command.split()[0], *files.split(), *camera, option, "none.json", "--quiet"]
+    refused(main([*words, "--out", str(out)]), "none.json")
     assert not out.exists()
-    if command == "register":  # the pose of another photograph goes, see above
-        return
-    name = "results.csv" if command in ("register several", "follow") else "inspect.json"
-    name = "result.json" if command == "demo" else name
-    with output_folder(out, command):
-        (out / name).write_text("an earlier result")
-    refused(main([*map(str, words)]), "none.json")
-    assert (out / name).read_text() == "an earlier result"
+    if name:  # of one photograph, the pose of another one goes, see above
+        with output_folder(out, command):
+            (out / name).write_text("an earlier result")
+        refused(main([*words, "--out", str(out)]), "none.json")
+        assert (out / name).read_text() == "an earlier result"
