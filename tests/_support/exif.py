@@ -19,6 +19,9 @@ def with_exif(path, block):
             data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + data[2:]
         )
     else:
-        chunk = b"eXIf" + block
-        chunk = struct.pack(">I", len(block)) + chunk + struct.pack(">I", zlib.crc32(chunk))
-        path.write_bytes(data[:33] + chunk + data[33:])
+        path.write_bytes(data[:33] + png_chunk(b"eXIf", block) + data[33:])
+
+
+def png_chunk(kind, content):
+    body = kind + content
+    return struct.pack(">I", len(content)) + body + struct.pack(">I", zlib.crc32(body))

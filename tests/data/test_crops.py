@@ -3,6 +3,7 @@ that they wrap."""
 
 import math
 import pickle
+from functools import partial
 
 import numpy as np
 import pytest
@@ -23,14 +24,20 @@ pytestmark = pytest.mark.usefixtures("mats_here")
 
 
 @pytest.fixture(params=["pascal", "bop", "web"])
-def dataset(request, tmp_path):
+def opened(request, tmp_path):
+    """A dataset with the functions that are given."""
     write, make = {
         "pascal": (write_pascal3d, Pascal3DPlus),
-        "bop": (write_bop, lambda root: BOPDataset(root, targets=False)),
+        "bop": (write_bop, partial(BOPDataset, targets=False)),
         "web": (write_web, PoseFolder),
     }[request.param]
     write(tmp_path)
-    return make(tmp_path)
+    return partial(make, tmp_path)
+
+
+@pytest.fixture
+def dataset(opened):
+    return opened()
 
 
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
@@ -164,35 +171,26 @@ def test_crops_refuse_wrong_options(tmp_path):
             crops(*arguments, **options)
 
 
-def test_datasets_transform_images_and_targets(dataset):
-    make = type(dataset)
-    options = {"targets": False} if make is BOPDataset else {}
-    changed = make(
-        dataset.root,
+def test_datasets_transform_images_and_targets(opened, dataset):
+    changed = opened(
         transform=lambda image: image.mean(),
-        target_transform=lambda sample: {
-            "pose": sample["rotation"],
-            "had_image": "image" in sample,
-        },
-        **options,
+        target_transform=lambda sample: {"pose": sample["rotation"], "had": set(sample)},
     )
     sample = changed[0]
     plain = dataset[0]
-    assert set(sample) == {"image", "pose", "had_image"}
+    assert set(sample) == {"image", "pose", "had"}
     assert torch.equal(sample["image"], plain["image"].mean())
     assert torch.equal(sample["pose"], plain["rotation"])
-    assert not sample["had_image"]
+    assert sample["had"] == set(plain) - {"image"}
     assert torch.equal(changed.annotation(0)["box"], dataset.annotation(0)["box"]), (
         "annotations are not transformed"
     )
 
 
-def test_a_transform_of_image_and_labels_may_move_pixels(dataset):
+def test_a_transform_of_image_and_labels_may_move_pixels(opened, dataset):
     """A transform of the image alone may not: box, camera and pose would not follow."""
-    make = type(dataset)
-    options = {"targets": False} if make is BOPDataset else {}
     plain = dataset[0]
-    half = make(dataset.root, transform=lambda image: image[:, ::2, ::2], **options)
+    half = opened(transform=lambda image: image[:, ::2, ::2])
     H, W = plain["image"].shape[1:]
     with refused(rf"of a photograph \(3, {H}, {W}\).*transforms="):
         half[0]
@@ -200,7 +198,7 @@ def test_a_transform_of_image_and_labels_may_move_pixels(dataset):
     def halve(image, sample):
         return image[:, ::2, ::2], {**sample, "box": sample["box"] / 2}
 
-    together = make(dataset.root, transform=lambda image: 1 - image, transforms=halve, **options)
+    together = opened(transform=lambda image: 1 - image, transforms=halve)
     sample = together[0]
     assert torch.equal(sample["image"], 1 - plain["image"][:, ::2, ::2])
     assert torch.equal(sample["box"], plain["box"] / 2)
@@ -211,10 +209,9 @@ def test_a_transform_of_image_and_labels_may_move_pixels(dataset):
 
 def test_datasets_say_what_they_are(dataset):
     name = type(dataset).__name__
-    split = {"Pascal3DPlus": ", split='val'", "BOPDataset": ", split='test'", "PoseFolder": ""}[
-        name
-    ]
-    assert repr(dataset) == f"{name}(root={str(dataset.root)!r}{split}, {len(dataset)} objects)"
+    splits = {"Pascal3DPlus": ", split='val'", "BOPDataset": ", split='test'", "PoseFolder": ""}
+    root = f"root={str(dataset.root)!r}{splits[name]}"
+    assert repr(dataset) == f"{name}({root}, {len(dataset)} objects)"
 
 
 def test_datasets_take_whole_numbers_only(dataset):

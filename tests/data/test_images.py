@@ -14,8 +14,17 @@ from curvireg_torch.data import images, read_image, read_photo
 from curvireg_torch.errors import ImageError, MissingFileError
 from curvireg_torch.formats import pictures
 from tests._support import refused
-from tests._support.exif import exif, with_exif
+from tests._support.exif import exif, png_chunk, with_exif
 from tests._support.miniature import write_image
+
+
+def photo_of(path, content):
+    """The photograph of a file with these bytes, or these pixels as OpenCV has them."""
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        assert cv2.imwrite(str(path), content)
+    return read_photo(path)
 
 
 @pytest.mark.parametrize(("dtype", "top"), [(np.uint8, 255), (np.uint16, 65535)])
@@ -39,22 +48,20 @@ def test_read_photo_scales_by_the_largest_value_of_pgm(tmp_path):
         b"P2 3 1 10 0 2 10\n",
         b"P6 1 1 4095\n" + np.array([0, 819, 4095], ">u2").tobytes(),  # one pixel in colour
     ):
-        (tmp_path / "a.pgm").write_bytes(content)
-        image = read_photo(tmp_path / "a.pgm").image
+        image = photo_of(tmp_path / "a.pgm", content).image
         assert (image[:, 0, 0] if content[:2] == b"P6" else image[0, 0]).tolist() == [0, 51, 255]
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_read_photo_inverts_tiff_in_which_white_is_zero(tmp_path, dtype):
     top = np.iinfo(dtype).max
-    Image.fromarray(np.array([[0, top // 5, top]], dtype)).save(tmp_path / "black.tif")
-    data = (tmp_path / "black.tif").read_bytes()
-    black = struct.pack("<HHIHH", 262, 3, 1, 1, 0)
-    white = struct.pack("<HHIHH", 262, 3, 1, 0, 0)
+    path = tmp_path / "a.tif"
+    Image.fromarray(np.array([[0, top // 5, top]], dtype)).save(path)
+    assert read_photo(path).image[0].tolist() == [[0, 51, 255]]
+    data = path.read_bytes()
+    black, white = (struct.pack("<HHIHH", 262, 3, 1, value, 0) for value in (1, 0))
     assert data.count(black) == 1
-    (tmp_path / "white.tif").write_bytes(data.replace(black, white))
-    assert read_photo(tmp_path / "black.tif").image[0].tolist() == [[0, 51, 255]]
-    assert read_photo(tmp_path / "white.tif").image[0].tolist() == [[255, 204, 0]]
+    assert photo_of(path, data.replace(black, white)).image[0].tolist() == [[255, 204, 0]]
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -77,12 +84,13 @@ def test_read_photo_applies_the_exif_orientation(tmp_path, suffix, orientation):
 @pytest.mark.parametrize(("dtype", "shape"), [(np.uint8, (20, 30, 3)), (np.uint16, (20, 30))])
 def test_read_image_applies_the_orientation_of_tiff_on_request(tmp_path, dtype, shape):
     pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape).astype(dtype)
-    for name, tags in (("plain.tif", {}), ("rotated.tif", {274: 6})):
-        Image.fromarray(pixels).save(tmp_path / name, tiffinfo=tags)
-    stored = read_image(tmp_path / "plain.tif")
-    assert torch.equal(read_image(tmp_path / "rotated.tif"), stored)
-    viewed = read_photo(tmp_path / "rotated.tif")
-    assert torch.equal(viewed.image / 255, stored.flip(1).transpose(1, 2))
+    plain = tmp_path / "plain.tif"
+    rotated = tmp_path / "rotated.tif"
+    for path, tags in ((plain, {}), (rotated, {274: 6})):
+        Image.fromarray(pixels).save(path, tiffinfo=tags)
+    stored = read_image(plain)
+    assert torch.equal(read_image(rotated), stored)
+    assert torch.equal(read_photo(rotated).image / 255, stored.flip(1).transpose(1, 2))
 
 
 def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
@@ -99,12 +107,18 @@ def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
     assert K[:2, 2].tolist() == [14.5, 19.5]
 
 
-def photo_with(folder, tags):
-    """A photograph with EXIF data of a camera, whose ``tags`` are others."""
+def photo_with(path, tags, size=(648, 432), orientation=1, **how):
+    """A photograph with EXIF data of a camera."""
     exif = Image.Exif()
-    exif.get_ifd(0x8769).update({0xA210: 2} | EOS | tags)
-    Image.new("RGB", (648, 432)).save(folder / "a.jpg", exif=exif)
-    return read_photo(folder / "a.jpg")
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769).update(tags)
+    Image.new("RGB", size).save(path, exif=exif, **how)
+    return read_photo(path)
+
+
+def photo_of_eos(folder, tags):
+    """A photograph of that camera, whose ``tags`` are others."""
+    return photo_with(folder / "a.jpg", {0xA210: 2} | EOS | tags)
 
 
 EOS = {0x920A: 50.0, 0xA20E: 5184 / 0.894, 0xA20F: 3456 / 0.596, 0xA002: 5184, 0xA003: 3456}
@@ -125,7 +139,7 @@ EOS = {0x920A: 50.0, 0xA20E: 5184 / 0.894, 0xA20F: 3456 / 0.596, 0xA002: 5184, 0
     ],
 )
 def test_the_size_of_the_sensor_gives_the_focal_length(tmp_path, tags, focal_35mm):
-    photo = photo_with(tmp_path, tags)
+    photo = photo_of_eos(tmp_path, tags)
     if focal_35mm is None:
         assert photo.focal_35mm is photo.camera() is None
         return
@@ -151,7 +165,7 @@ def test_the_size_of_the_sensor_gives_the_focal_length(tmp_path, tags, focal_35m
 def test_a_digital_zoom_counts_or_makes_the_focal_length_uncertain(
     tmp_path, tags, zoom, focal, deviation
 ):
-    photo = photo_with(tmp_path, tags)
+    photo = photo_of_eos(tmp_path, tags)
     assert photo.digital_zoom == zoom
     assert any("perhaps not in the focal" in note for note in photo.notes) == (zoom > 1)
     camera = photo.camera()
@@ -164,8 +178,7 @@ def test_a_digital_zoom_counts_or_makes_the_focal_length_uncertain(
 
 
 def test_panoramas_have_no_pinhole_camera(tmp_path):
-    tags = Image.Exif()
-    tags.get_ifd(0x8769).update({0xA405: 26})
+    tags = {0xA405: 26}
     xmp = b'<x:xmpmeta><rdf:Description GPano:ProjectionType="cylindrical"/></x:xmpmeta>'
     for name, size, words, is_panorama in (
         ("a.jpg", (640, 480), xmp, True),
@@ -176,25 +189,23 @@ def test_panoramas_have_no_pinhole_camera(tmp_path):
         ("e.jpg", (256, 641), b"", True),
         ("f.jpg", (640, 270), b"", False),  # 21 : 9
     ):
-        Image.new("RGB", size).save(tmp_path / name, exif=tags, xmp=words)
-        photo = read_photo(tmp_path / name)
+        photo = photo_with(tmp_path / name, tags, size, xmp=words)
         assert photo.is_panorama == is_panorama
         assert (photo.camera() is None) == is_panorama
     Image.new("RGB", (641, 256)).save(tmp_path / "g.png")  # of whatever camera
     assert not read_photo(tmp_path / "g.png").is_panorama
-    tags.get_ifd(0x8769).update({0xA002: 800, 0xA003: 600})
-    Image.new("RGB", (641, 200)).save(tmp_path / "h.jpg", exif=tags)  # cut out of a picture
-    assert not read_photo(tmp_path / "h.jpg").is_panorama
+    tags |= {0xA002: 800, 0xA003: 600}  # cut out of a picture
+    assert not photo_with(tmp_path / "h.jpg", tags, (641, 200)).is_panorama
 
 
 def test_read_photo_rounds_16_bits_converts_cmyk_and_notes_changes_of_channels(tmp_path):
-    cv2.imwrite(str(tmp_path / "b.png"), np.array([[0, 128, 129, 65535]], np.uint16))
-    assert read_photo(tmp_path / "b.png").image[0].tolist() == [[0, 0, 1, 255]]
+    deep = photo_of(tmp_path / "b.png", np.array([[0, 128, 129, 65535]], np.uint16))
+    assert deep.image[0].tolist() == [[0, 0, 1, 255]]
     notes = {1: ("grey: three equal channels",), 3: (), 4: ("alpha channel dropped",)}
     for name in ("1.png", "4.png", "3.webp", "4.webp", "1.tiff", "3.bmp", "1.pgm"):
         count = int(name[0])
-        assert cv2.imwrite(str(tmp_path / name), np.full((4, 4, count), 9, np.uint8))
-        assert read_photo(tmp_path / name).notes == notes[count], name
+        photo = photo_of(tmp_path / name, np.full((4, 4, count), 9, np.uint8))
+        assert photo.notes == notes[count], name
     colour = Image.new("RGB", (8, 8))  # phones add previews to photographs
     colour.save(tmp_path / "phone.jpg", format="MPO", save_all=True, append_images=[colour])
     assert read_photo(tmp_path / "phone.jpg").notes == ()
@@ -242,15 +253,10 @@ def test_read_photo_counts_pixels_before_it_decodes(tmp_path):
     bmp = b"BM" + bytes(12) + struct.pack("<IiiHHI", 40, side, -side, 1, 24, 0) + bytes(20)
     packer = zlib.compressobj(9)
     body = b"".join(packer.compress(bytes(1 + side // 8)) for _ in range(side)) + packer.flush()
-    chunks = (
-        (b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)),
-        (b"IDAT", body),
-        (b"IEND", b""),
-    )
-    chunks = [
-        struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in chunks
-    ]
-    for name, content in (("a.bmp", bmp), ("a.png", b"\x89PNG\r\n\x1a\n" + b"".join(chunks))):
+    png = b"\x89PNG\r\n\x1a\n"
+    png += png_chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0))
+    png += png_chunk(b"IDAT", body) + png_chunk(b"IEND", b"")
+    for name, content in (("a.bmp", bmp), ("a.png", png)):
         (tmp_path / name).write_bytes(content)
         tracemalloc.start()
         with refused(rf"{name}: more than 89,478,485 pixels; scale it down", ImageError):
@@ -274,20 +280,13 @@ def test_read_photo_keeps_the_orientation_if_the_rest_of_exif_is_damaged(tmp_pat
     write_image(path)
     plain = path.read_bytes()
     whole = exif(6, focal=27)
-    for block in (
-        whole[:38],
-        whole[:41],
-        whole[:30] + b"\xff" * 4 + whole[34:],
-        whole[:38] + b"\xff" * 18,
-    ):
+    ends = (b"", whole[38:41], b"\xff" * 18)
+    damaged = [*(whole[:38] + end for end in ends), whole[:30] + b"\xff" * 4 + whole[34:]]
+    for block in (*damaged, exif(0), exif(9), b"XX" + whole[2:], whole[:20], b""):
         path.write_bytes(plain)
         with_exif(path, block)
         photo = read_photo(path)
-        assert (photo.orientation, photo.focal_35mm) == (6, None)
-    for block in (exif(0), exif(9), b"XX" + whole[2:], whole[:20], b""):
-        path.write_bytes(plain)
-        with_exif(path, block)
-        assert read_photo(path).orientation == 1
+        assert (photo.orientation, photo.focal_35mm) == (6 if block in damaged else 1, None)
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14])
@@ -295,8 +294,7 @@ def test_read_photo_keeps_the_orientation_if_the_rest_of_exif_is_damaged(tmp_pat
 def test_few_bits_in_sixteen_are_stretched(tmp_path, bits, channels):
     pixels = np.random.default_rng(bits).integers(0, 2**bits, (6, 8, channels)).astype(np.uint16)
     pixels[0, 0] = 2**bits - 1
-    cv2.imwrite(str(tmp_path / "camera.png"), pixels)
-    photo = read_photo(tmp_path / "camera.png")
+    photo = photo_of(tmp_path / "camera.png", pixels)
     shown = photo.image.movedim(0, -1).numpy()
     assert np.abs(shown - pixels[..., ::-1] * 255.0 / (2**bits - 1)).max() <= 0.5 + 1e-9
     assert f"16 bits, of which the lower {bits} are used: stretched" in photo.notes
@@ -304,49 +302,44 @@ def test_few_bits_in_sixteen_are_stretched(tmp_path, bits, channels):
 
 def test_sixteen_bits_that_are_used_are_not_stretched(tmp_path):
     pixels = np.full((4, 4), 2**14, np.uint16)
-    cv2.imwrite(str(tmp_path / "a.png"), pixels)
-    photo = read_photo(tmp_path / "a.png")
+    photo = photo_of(tmp_path / "a.png", pixels)
     assert int(photo.image.max()) == 64
     assert photo.notes == ("grey: three equal channels",)
-    cv2.imwrite(str(tmp_path / "black.png"), 0 * pixels)
-    assert read_photo(tmp_path / "black.png").notes == ("grey: three equal channels",)
-    cv2.imwrite(
-        str(tmp_path / "colour.tif"),
-        np.random.default_rng(0).integers(0, 4096, (9, 9, 3)).astype(np.uint16),
-    )
-    (note,) = read_photo(tmp_path / "colour.tif").notes
+    assert photo_of(tmp_path / "black.png", 0 * pixels).notes == photo.notes
+    colours = np.random.default_rng(0).integers(0, 4096, (9, 9, 3)).astype(np.uint16)
+    (note,) = photo_of(tmp_path / "colour.tif", colours).notes
     assert note == "16 bits, of which the lower ones are used: 16 levels remain; save it as PNG"
 
 
 @pytest.mark.parametrize("count", [1, 2, pictures.MAX_THUMBNAILS - 1])
 def test_thumbnails_before_the_picture_of_a_tiff_are_passed_over(tmp_path, count):
-    pages = [Image.new("L", (4, 4), 10 * page) for page in range(count)]
-    for page in pages:
-        page.encoderinfo = {"tiffinfo": {254: 1}}
-    picture = Image.new("L", (8, 6), 200)
-    picture.encoderinfo = {"tiffinfo": {}}
-    pages[0].save(
-        tmp_path / "a.tif", tiffinfo={254: 1}, save_all=True, append_images=[*pages[1:], picture]
-    )
-    assert read_photo(tmp_path / "a.tif").image.shape == (3, 6, 8)
-    pages.append(pages[0].copy())
-    pages[-1].encoderinfo = {"tiffinfo": {254: 1}}
-    pages[0].save(tmp_path / "b.tif", tiffinfo={254: 1}, save_all=True, append_images=pages[1:])
+    path = tmp_path / "a.tif"
+    thumbnail = {254: 1}
+
+    def photo_after(size, tags):
+        """Of ``count`` thumbnails and a last page."""
+        pages = [Image.new("L", (4, 4), 10 * page) for page in range(count)]
+        for page in pages:
+            page.encoderinfo = {"tiffinfo": thumbnail}
+        last = Image.new("L", size, 200)
+        last.encoderinfo = {"tiffinfo": tags}
+        pages[0].save(path, tiffinfo=thumbnail, save_all=True, append_images=[*pages[1:], last])
+        return read_photo(path)
+
+    assert photo_after((8, 6), {}).image.shape == (3, 6, 8)
     with refused("holds thumbnails only", ImageError):
-        read_photo(tmp_path / "b.tif")
+        photo_after((4, 4), thumbnail)
 
 
 def test_a_dark_pgm_is_not_stretched_as_it_names_its_largest_value(tmp_path):
-    (tmp_path / "a.pgm").write_bytes(b"P5 2 1 65535\n" + np.array([0, 2570], ">u2").tobytes())
-    photo = read_photo(tmp_path / "a.pgm")
+    content = b"P5 2 1 65535\n" + np.array([0, 2570], ">u2").tobytes()
+    photo = photo_of(tmp_path / "a.pgm", content)
     assert photo.image[0, 0].tolist() == [0, 10]
     assert photo.notes == ("grey: three equal channels",)
 
 
 def test_exif_camera_respects_crops_and_pictures_of_pillow(tmp_path):
-    tags = Image.Exif()
-    tags[0x0112] = 6  # turned by a quarter
-    tags.get_ifd(0x8769).update({0xA405: 26, 0xA002: 400, 0xA003: 300})
+    tags = {0xA405: 26, 0xA002: 400, 0xA003: 300}
     diagonal = math.hypot(36.0, 24.0)
     for size, focal in (
         ((400, 300), 500.0),
@@ -358,8 +351,7 @@ def test_exif_camera_respects_crops_and_pictures_of_pillow(tmp_path):
         ((204, 150), 500.0),  # cut out
     ):
         path = tmp_path / "photo.jpg"
-        Image.new("RGB", size).save(path, exif=tags)
-        photo = read_photo(path)
+        photo = photo_with(path, tags, size, orientation=6)  # turned by a quarter
         with Image.open(path) as picture:
             same = images.photo_of_picture(picture)
         assert tuple(photo.image.shape[1:]) == tuple(same.image.shape[1:]) == size
@@ -370,7 +362,7 @@ def test_exif_camera_respects_crops_and_pictures_of_pillow(tmp_path):
         assert float(camera.matrix[0, 0]) == pytest.approx(26 * focal / diagonal)
         assert torch.equal(camera.matrix, same.camera().matrix)
         assert (camera.source, camera.focal_deviation) == ("exif", 0.05)
-        assert camera.matrix[:2, 2].tolist() == [(size[1] - 1) / 2, (size[0] - 1) / 2]
+        assert camera.matrix[:2, 2].tolist() == [(side - 1) / 2 for side in size[::-1]]
 
 
 @pytest.mark.parametrize(
@@ -381,9 +373,8 @@ def test_exif_camera_respects_crops_and_pictures_of_pillow(tmp_path):
     ],
 )
 def test_what_a_download_leaves_in_place_of_a_photograph_is_named(tmp_path, start, words):
-    (tmp_path / "a.jpg").write_bytes(start)
     with refused(rf"a\.jpg: {words}", ImageError):
-        read_photo(tmp_path / "a.jpg")
+        photo_of(tmp_path / "a.jpg", start)
 
 
 def test_palettes_with_several_transparent_colours(tmp_path, recwarn):
