@@ -44,22 +44,22 @@ def rig(tmp_path):
     return lambda header, row: read_rig(written(tmp_path / "rig.csv", header, row))
 
 
-@pytest.mark.parametrize("name", ["a{blanks}b.png", "{blanks}", "a{blanks}", "a/{blanks}/b"])
-def test_names_of_colmap_with_blanks_are_read_in_linear_time(tmp_path, images, name):
+NAMES = ("a{many}b.png", "{many}", "a{many}", "a/{many}/b")
+NUMBERS = ("1" * 9 + " {many}", "1 1 0 0 0 0 0 1 {many}", "{many} " * 9, "1 " * 7 + "{many}")
+
+
+@pytest.mark.parametrize(
+    ("line", "many", "size"),
+    [
+        *(("1 1 0 0 0 0 0 1 1 " + name, " ", 20_000) for name in NAMES),
+        *((line, "1", 100_000) for line in NUMBERS),
+    ],
+)
+def test_lines_of_colmap_are_read_in_linear_time(tmp_path, images, line, many, size):
     def make(count):
-        line = "1 1 0 0 0 0 0 1 1 " + name.format(blanks=" " * count)
-        images(line)
+        images(line.format(many=many * count))
 
-    check_linear(lambda _: read_rig(tmp_path, find=only_in(tmp_path)), make, 20_000)
-
-
-def test_numbers_of_colmap_are_read_in_linear_time(tmp_path, images):
-    for line in ("1" * 9 + " {many}", "1 1 0 0 0 0 0 1 {many}", "{many} " * 9, "1 " * 7 + "{many}"):
-
-        def make(count, line=line):
-            images(line.format(many="1" * count))
-
-        check_linear(lambda _: read_rig(tmp_path, find=only_in(tmp_path)), make, 100_000)
+    check_linear(lambda _: read_rig(tmp_path, find=only_in(tmp_path)), make, size)
 
 
 def test_a_name_of_colmap_keeps_its_inner_blanks(tmp_path, images):
@@ -121,19 +121,14 @@ def test_names_that_no_file_can_have_are_missing_files(tmp_path, name):
             read_rig(rig, find=find)
 
 
-IMAGE = "{0} 1 0 0 0 0 0 1 1 {0}.png"
+IMAGES = ONE, TWO, THREE = [f"{k} 1 0 0 0 0 0 1 1 {k}.png" for k in (1, 2, 3)]
 LAYOUTS = {
-    "no points": [IMAGE.format(k) for k in (1, 2, 3)],
-    "empty points": [line for k in (1, 2, 3) for line in (IMAGE.format(k), "")],
-    "points": [line for k in (1, 2, 3) for line in (IMAGE.format(k), "1.5 2 -1 3 4 17")],
-    "points of some": [IMAGE.format(1), "1 2 3", IMAGE.format(2), IMAGE.format(3), "", "# the end"],
-    "blank lines": ["", IMAGE.format(1), "", "", IMAGE.format(2), "1.5 2 -1", "", IMAGE.format(3)],
-    "points like an image": [
-        IMAGE.format(1),
-        "1 1 0 0 0 0 0 1 1 2 3 4",
-        IMAGE.format(2),
-        IMAGE.format(3),
-    ],
+    "no points": IMAGES,
+    "empty points": [line for image in IMAGES for line in (image, "")],
+    "points": [line for image in IMAGES for line in (image, "1.5 2 -1 3 4 17")],
+    "points of some": [ONE, "1 2 3", TWO, THREE, "", "# the end"],
+    "blank lines": ["", ONE, "", "", TWO, "1.5 2 -1", "", THREE],
+    "points like an image": [ONE, "1 1 0 0 0 0 0 1 1 2 3 4", TWO, THREE],
 }
 
 
@@ -143,7 +138,7 @@ def test_every_photograph_of_colmap_is_read_with_and_without_lines_of_points(
 ):
     images("\n".join(lines))
     assert [view.name for view in read_rig(tmp_path)] == [f"image {k}.png" for k in (1, 2, 3)]
-    images("\n".join([IMAGE.format(1), "1 2 3.5", IMAGE.format(2)]))
+    images("\n".join([ONE, "1 2 3.5", TWO]))
     with refused("expected IMAGE_ID"):
         read_rig(tmp_path)
 
@@ -221,19 +216,12 @@ def test_a_photograph_of_colmap_whose_name_is_a_number_is_no_line_of_points(tmp_
     assert [view.name for view in read_rig(tmp_path)] == ["image 7", "image 8"]
 
 
-def test_an_object_that_a_photograph_of_bop_shows_twice_has_no_box_there(tmp_path):
-    """Which of the two is meant is not known: it is searched for."""
-    objects = {"0": [2, 1], "1": [1, 1], "2": [2]}
-    truth = {key: [{"obj_id": number} for number in numbers] for key, numbers in objects.items()}
-    boxes = {
-        key: [{"bbox_obj": [10 * k, 5, 20, 30]} for k, _ in enumerate(numbers, start=1)]
-        for key, numbers in objects.items()
-    }
-    write_scene(tmp_path, camera=dict.fromkeys(objects, CAMERA), gt=truth, gt_info=boxes)
-    found = [view.box for view in read_rig(tmp_path, Path("obj_000001.ply"))]
-    assert found[0] is not None
-    assert float(found[0][0]) == pytest.approx(20.0, abs=1.0), "of the second object"
-    assert found[1:] == [None, None]
+def test_a_photograph_of_bop_that_does_not_show_the_object_has_no_box(tmp_path):
+    truth = {"0": [{"obj_id": 2}]}
+    boxes = {"0": [{"bbox_obj": [10, 5, 20, 30]}]}
+    write_scene(tmp_path, camera={"0": CAMERA}, gt=truth, gt_info=boxes)
+    (view,) = read_rig(tmp_path, Path("obj_000001.ply"))
+    assert view.box is None
 
 
 def view(photo, camera, scale=1.0):
