@@ -10,7 +10,7 @@ from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import MissingFileError
 from tests._support import refused
 from tests._support.miniature import write_bop, write_mesh
-from tests._support.tables import text_table
+from tests._support.tables import check_values, text_table
 
 
 @pytest.fixture
@@ -59,15 +59,17 @@ def test_bop_dataset_counts_skipped_items_and_returns_documented_samples(root, r
     """
     assert set(sample) == set(names.split())
     assert sample["image"].shape == (3, 60, 80)
-    assert sample["box"].tolist() == [-5, 4, 25, 24], (
-        "x, y, width, height become corners, and may leave the image"
+    check_values(
+        sample,
+        box=[-5, 4, 25, 24],  # corners, which may lie outside of the image
+        box_visible=[0, 4, 25, 24],
+        camera_matrix=[[300, 0, 40], [0, 310, 30], [0, 0, 1]],
+        rotation=[[1, 0, 0], [0, 0, -1], [0, 1, 0]],  # row by row
+        translation=[1, 2, 400],
+        visib_fract=0.8,
+        model_info=dataset.models_info[1],
     )
-    assert sample["box_visible"].tolist() == [0, 4, 25, 24]
-    assert sample["camera_matrix"].tolist() == [[300, 0, 40], [0, 310, 30], [0, 0, 1]]
-    assert sample["rotation"].tolist() == [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "row by row"
-    assert (sample["translation"].tolist(), sample["visib_fract"]) == ([1, 2, 400], 0.8)
     assert sample["model_path"].endswith("models/obj_000001.ply")
-    assert sample["model_info"] == dataset.models_info[1]
     assert "symmetries_discrete" in sample["model_info"]
 
 
@@ -112,10 +114,7 @@ def test_each_target_that_cannot_be_used_is_counted_once(root):
     dataset = BOPDataset(root)
     assert ids(dataset) == ALL[:3:2]
     skipped = dataset.skipped_items
-    assert (skipped["missing_mesh"], skipped["missing_image"]) == (
-        ["test/000001/3 #3"],
-        ["test/000001/4 #0"],
-    )
+    check_values(skipped, missing_mesh=["test/000001/3 #3"], missing_image=["test/000001/4 #0"])
     assert Counter(skipped["missing_annotation"]) == {
         "test/000001/000000 object 1": 3,
         "test/000001/000006 object 1": 2,

@@ -8,7 +8,7 @@ from curvireg_torch.errors import ImageError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from tests._support import refused
 from tests._support.miniature import pascal_object, write_image, write_pascal3d, write_record
-from tests._support.tables import text_table
+from tests._support.tables import check_values, text_table
 
 pytestmark = pytest.mark.usefixtures("mats_here")
 
@@ -54,26 +54,27 @@ def test_pascal3d_returns_documented_samples(root):
     """
     assert set(sample) == set(names.split())
     assert sample["image"].shape == (3, 60, 80)
-    assert sample["box"].tolist() == [10, 5, 70, 55], "boxes of the release count from 1"
-    assert sample["camera_matrix"].tolist() == [[3000, 0, 40], [0, 3000, 30], [0, 0, 1]]
-    assert sample["viewpoint"].tolist() == [30, 10, -5]
+    check_values(
+        sample,
+        box=[10, 5, 70, 55],  # those of the release count from 1
+        camera_matrix=[[3000, 0, 40], [0, 3000, 30], [0, 0, 1]],
+        viewpoint=[30, 10, -5],
+        translation=[0, 0, 40],
+        category="car",
+        cad_index=1,
+        image_id="2008_000001",
+        truncated=False,
+        occluded=False,
+        difficult=False,
+    )
     torch.testing.assert_close(
         sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0).float()
     )
-    assert sample["translation"].tolist() == [0, 0, 40]
-    assert (sample["category"], sample["cad_index"], sample["image_id"]) == (
-        "car",
-        1,
-        "2008_000001",
-    )
     assert sample["cad_path"].endswith("01.off")
     assert all(v.dtype == torch.float32 for v in sample.values() if isinstance(v, torch.Tensor))
-    assert (sample["truncated"], sample["occluded"], sample["difficult"]) == (False, False, False)
     shifted = Pascal3DPlus(root, pixel_origin=0)[0]
-    assert (shifted["box"].tolist(), shifted["camera_matrix"][:2, 2].tolist()) == (
-        [11, 6, 71, 56],
-        [41, 31],
-    )
+    K = [[3000, 0, 41], [0, 3000, 31], [0, 0, 1]]
+    check_values(shifted, box=[11, 6, 71, 56], camera_matrix=K)
 
 
 @pytest.mark.parametrize("name", ["truncated", "occluded", "difficult"])
@@ -100,8 +101,8 @@ def test_pascal3d_defaults_of_missing_camera_fields_and_invalid_cad_indices(root
     viewpoint = {"azimuth": 10.0, "elevation": 20.0, "distance": 3.0}
     write_record(record, [{**pascal_object("car"), "viewpoint": viewpoint}])
     sample = cars(root)[0]
-    assert sample["camera_matrix"].tolist() == [[3000, 0, 40], [0, 3000, 30], [0, 0, 1]]
-    assert sample["viewpoint"].tolist() == [10, 20, 0]
+    K = [[3000, 0, 40], [0, 3000, 30], [0, 0, 1]]
+    check_values(sample, camera_matrix=K, viewpoint=[10, 20, 0])
     before = cars(root).skipped["missing_mesh"]
     invalid = (-1.0, 0.0, 1e300, math.nan, math.inf, "one")
     write_record(record, [pascal_object("car", cad_index=index) for index in invalid])

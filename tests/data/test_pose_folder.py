@@ -7,6 +7,7 @@ from curvireg_torch.errors import MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from tests._support import refused, slow_after
 from tests._support.miniature import write_mesh, write_web
+from tests._support.tables import check_values
 
 
 @pytest.fixture
@@ -24,11 +25,11 @@ def test_pose_folder_counts_skipped_items_and_returns_documented_samples(tree):
         "image image_path image_id box viewpoint rotation distance category mesh_path object_index"
     )
     assert (set(sample), sample["image"].shape) == (set(names.split()), (3, 60, 80))
-    assert (sample["box"].tolist(), sample["viewpoint"].tolist()) == ([10, 5, 70, 55], [30, 10, -5])
+    known = {"box": [10, 5, 70, 55], "viewpoint": [30, 10, -5], "distance": 3, "category": "cup"}
+    check_values(sample, **known)
     torch.testing.assert_close(
         sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0).float()
     )
-    assert (sample["distance"], sample["category"]) == (3, "cup")
     assert sample["mesh_path"].endswith("mesh.off")
     assert unknown["viewpoint"].isnan().all()
     assert unknown["rotation"].isnan().all()

@@ -17,6 +17,7 @@ from tests._support import double, eye, refused
 from tests._support.lists import bop_poses, lines, table
 from tests._support.small import SMALL, rows_of, run
 from tests._support.spies import spied
+from tests._support.tables import check_values
 
 ANY = Protocol(pose="any")
 
@@ -30,10 +31,10 @@ def test_evaluate_pascal3d(pascal, tmp_path):
     benchmark = Pascal3DBenchmark(pascal, Protocol())
     assert [benchmark.selection(count) for count in (2, 9)] == [[0, 2], [0, 1, 2, 3, 4]], "spread"
     summary = run(benchmark, tmp_path / "out")
-    assert summary["n"] == 3
+    check_values(summary, n=3, failed=0)
     skipped = summary["skipped"]
-    assert (skipped["unreadable_image"], skipped["unreadable_mesh"], summary["failed"]) == (1, 1, 0)
-    assert skipped["missing_image"] == 1, "objects that the dataset leaves out are counted"
+    # those that the dataset leaves out are counted too
+    check_values(skipped, unreadable_image=1, unreadable_mesh=1, missing_image=1)
     assert "other_class" not in skipped, "objects of other classes are not"
     rows = rows_of(benchmark, tmp_path / "out")
     assert {key: (row.get("skipped"), row["verdict"]) for key, row in rows.items()} == {
@@ -60,7 +61,7 @@ def test_evaluate_pascal3d(pascal, tmp_path):
 def test_evaluate_bop(bop, tmp_path):
     benchmark = BOPBenchmark(bop, ANY)
     summary = run(benchmark, tmp_path / "out")
-    assert (summary["n"], summary["failed"]) == (4, 1), "one photograph is of one colour"
+    check_values(summary, n=4, failed=1)  # one photograph is of one colour
     nowhere = {**benchmark.samples[3], "box": torch.full((4,), torch.nan)}
     benchmark.entries[3] = benchmark._entry(nowhere)
     assert run(benchmark, tmp_path / "unknown")["skipped"]["unknown_box"] == 1
@@ -185,7 +186,7 @@ def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_fi
     assert evaluate(*words, "--limit", "2")["limit"] == 2
     summary = evaluate(*words)
     assert list(summary["per_class"]) == ["car"]
-    assert (summary["n"], summary["protocol"]) == (3, "cad=annotated pose=upright box=annotated")
+    check_values(summary, n=3, protocol="cad=annotated pose=upright box=annotated")
     printed = capsys.readouterr().out.splitlines()
     assert printed[-3].startswith("3 objects, 0 failed, ")
     numbers = f"acc_pi_6 {summary['acc_pi_6']:.3f}   acc_pi_18 {summary['acc_pi_18']:.3f}   "
@@ -205,15 +206,14 @@ def test_evaluate_keeps_the_views_of_the_preset_paper(pascal, evaluate, tmp_path
     settings = summary_in(tmp_path)["settings"]
     assert (settings["preset"], settings["protocol"].split()[1]) == ("paper", "pose=upright")
     views = settings["pipeline"]["views"]
-    assert (views["pose"], views["frame"]) == ("paper", "principal")
+    check_values(views, pose="paper", frame="principal")
 
 
 def test_evaluate_bop_assumes_any_pose(bop, evaluate):
     summary = evaluate("bop", bop.root, "--protocol", "box=0.1", "seed=3")
-    assert summary["protocol"] == "cad=annotated pose=any box=0.1 seed=3"
-    assert summary["settings"]["dataset"] == "bop"
-    views = summary["settings"]["pipeline"]["views"]
-    assert (views["pose"], views["directions"], views["theta_step"]) == ("any", 18, 360.0)
+    settings = summary["settings"]
+    check_values(settings, dataset="bop", protocol="cad=annotated pose=any box=0.1 seed=3")
+    check_values(settings["pipeline"]["views"], pose="any", directions=18, theta_step=360.0)
 
 
 def test_evaluate_without_boxes_reports_detection(pascal, evaluate, tmp_path, capsys, monkeypatch):

@@ -16,7 +16,7 @@ from curvireg_torch.jobs.store import ResultStore, to_json
 from tests._support import double, refused
 from tests._support.lists import bop_poses, table
 from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
-from tests._support.tables import text_table
+from tests._support.tables import check_values, text_table
 
 MATS_HERE = pytest.mark.usefixtures("mats_here")
 ANY = Protocol(pose="any")
@@ -28,16 +28,21 @@ SKIPPED = {"skipped": "x"}
 FAILED = {"verdict": "failed", "message": "?"}
 
 
-def rotated(sample, axis, degrees):
-    """The true rotation after a rotation of the model about x or z."""
+def degrees(value):
+    """An angle up to rounding."""
+    return pytest.approx(value, abs=1e-3)
+
+
+def rotated(sample, axis, angle):
+    """The true rotation after a rotation of the model by so many degrees about x or z."""
     vector = torch.zeros(3).double()
-    vector["xyz".index(axis)] = math.radians(degrees)
+    vector["xyz".index(axis)] = math.radians(angle)
     return (sample["rotation"].double() @ rotation_from_axis_angle(vector)).tolist()
 
 
-def posed(sample, degrees, offset=(0.0, 0.0, 0.0)):
+def posed(sample, angle, offset=(0.0, 0.0, 0.0)):
     """A result whose pose is a rotation about z off, and an offset."""
-    rotation = rotated(sample, "z", degrees)
+    rotation = rotated(sample, "z", angle)
     translation = (sample["translation"] + torch.tensor(offset)).tolist()
     return {"rotation": rotation, "translation": translation, "inputs": INPUTS}
 
@@ -85,33 +90,42 @@ def test_pascal3d_summary(furniture, tmp_path):
     summary = scores_of(furniture, tmp_path, [*rows, {"skipped": "unreadable_image"}])
     assert (tmp_path / "summary.json").read_text() == to_json(summary)
     # errors: bottles 90, 40, 20, miss; table 180; sofas 5, 20, 180
-    assert (summary["n"], summary["failed"], summary["skipped"]) == (8, 1, {"unreadable_image": 1})
-    assert (summary["acc_pi_6"], summary["acc_pi_18"]) == (3 / 8, 1 / 8)
-    assert summary["med_err_deg"] == pytest.approx(65, abs=1e-3)
+    check_values(
+        summary,
+        n=8,
+        failed=1,
+        skipped={"unreadable_image": 1},
+        acc_pi_6=3 / 8,
+        acc_pi_18=1 / 8,
+        med_err_deg=degrees(65),
+        seconds={"bank": 16.0, "register": 4.0, "register_each": 0.5},
+    )
     # with symmetries: bottles 0, 0, 20, miss; table 0
-    aware = summary["symmetry_aware"]
-    assert (aware["acc_pi_6"], aware["acc_pi_18"]) == (6 / 8, 4 / 8)
-    assert aware["med_err_deg"] == pytest.approx(12.5, abs=1e-3)
-    sizes = {name: s["n"] for name, s in summary["subsets"].items()}
+    aware = {"acc_pi_6": 6 / 8, "acc_pi_18": 4 / 8, "med_err_deg": degrees(12.5)}
+    assert summary["symmetry_aware"] == aware
+    subsets = summary["subsets"]
+    sizes = {name: s["n"] for name, s in subsets.items()}
     assert sizes == {"easy": 3, "truncated": 3, "occluded": 2, "difficult": 1}
-    assert summary["subsets"]["easy"]["acc_pi_6"] == 1 / 3
-    assert summary["subsets"]["difficult"]["med_err_deg"] == float("inf")
+    check_values(subsets["easy"], acc_pi_6=1 / 3)
+    check_values(subsets["difficult"], med_err_deg=math.inf)
     sizes = {name: s["n"] for name, s in summary["per_class"].items()}
     assert sizes == {"bottle": 4, "diningtable": 1, "sofa": 3}
-    assert summary["per_class"]["sofa"]["acc_pi_6"] == 2 / 3
+    check_values(summary["per_class"]["sofa"], acc_pi_6=2 / 3)
     # classes: bottles 1/4, table 0, sofas 2/3; with symmetries 3/4, 1, 2/3
     mean = summary["mean_over_classes"]
-    assert (mean["n_classes"], mean["acc_pi_6"]) == (3, pytest.approx((1 / 4 + 0 + 2 / 3) / 3))
-    assert mean["acc_pi_18"] == pytest.approx((0 + 0 + 1 / 3) / 3)
-    assert mean["med_err_deg"] == pytest.approx((65 + 180 + 20) / 3, abs=1e-3)
-    assert mean["symmetry_aware"]["acc_pi_6"] == pytest.approx((3 / 4 + 1 + 2 / 3) / 3)
+    check_values(
+        mean,
+        n_classes=3,
+        acc_pi_6=pytest.approx((1 / 4 + 0 + 2 / 3) / 3),
+        acc_pi_18=pytest.approx((0 + 0 + 1 / 3) / 3),
+        med_err_deg=degrees((65 + 180 + 20) / 3),
+    )
+    check_values(mean["symmetry_aware"], acc_pi_6=pytest.approx((3 / 4 + 1 + 2 / 3) / 3))
     # easy ones: a bottle that is 90 degrees off, the table, the sofa that is 5 degrees off
-    easy = summary["subsets"]["easy"]
-    right = {name: s["acc_pi_18"] for name, s in easy["per_class"].items()}
+    right = {name: s["acc_pi_18"] for name, s in subsets["easy"]["per_class"].items()}
     assert right == {"bottle": 0, "diningtable": 0, "sofa": 1}
-    assert easy["mean_over_classes"]["med_err_deg"] == pytest.approx((90 + 180 + 5) / 3, abs=1e-3)
-    assert summary["seconds"] == {"bank": 16.0, "register": 4.0, "register_each": 0.5}
-    assert summary["settings"]["root"] == "where", "a summary is shared: no paths"
+    check_values(subsets["easy"]["mean_over_classes"], med_err_deg=degrees((90 + 180 + 5) / 3))
+    check_values(summary["settings"], root="where")  # a summary is shared: no paths
 
 
 @MATS_HERE
@@ -119,16 +133,16 @@ def test_pascal3d_table(furniture, tmp_path):
     R = rotation_from_viewpoint(*double([200.0, 10, -5])).tolist()
     scores_of(furniture, tmp_path, [{"rotation": R}, FAILED] + [SKIPPED] * 7)
     first, second = table(tmp_path, "predictions.csv")
-    assert (first["category"], first["image_id"], first["truncated"]) == ("bottle", "1", "0")
     angles = ("azimuth", "elevation", "theta")
-    assert [float(first[name]) for name in angles] == pytest.approx([200, 10, -5], abs=1e-3)
+    assert [float(first[name]) for name in angles] == degrees([200, 10, -5])
     truth = furniture.dataset.annotation(0)["viewpoint"].tolist()
     assert [float(first["true_" + name]) for name in angles] == truth
-    assert float(first["symmetric_error_deg"]) == pytest.approx(0, abs=1e-3)
+    assert float(first["symmetric_error_deg"]) == degrees(0)
     assert 150 < float(first["error_deg"]) <= 170
-    assert first["seconds"] == "0.5", "of the registration, without the bank"
-    assert first["mesh"] == "01.off"
-    assert (second["failed"], second["azimuth"], second["error_deg"]) == ("?", "", "inf")
+    # seconds of the registration, without the bank
+    known = {"category": "bottle", "image_id": "1", "truncated": "0", "seconds": "0.5"}
+    check_values(first, mesh="01.off", **known)
+    check_values(second, failed="?", azimuth="", error_deg="inf")
 
 
 def test_bop_summary(instances, tmp_path):
@@ -140,14 +154,11 @@ def test_bop_summary(instances, tmp_path):
     last = posed(samples[3], 20, (0.0, 0.04 * 86.6, 0.0))
     rows = [first, posed(samples[1], 180), FAILED, last]
     summary = scores_of(benchmark, tmp_path, rows)
-    assert (summary["n"], summary["failed"]) == (4, 1)
     # errors 0, 180, miss, 20
-    assert (summary["acc_15_deg"], summary["acc_30_deg"]) == (1 / 4, 2 / 4)
-    assert (summary["med_err_deg"], summary["per_object"]["2"]["acc_30_deg"]) == (
-        pytest.approx(100, abs=1e-3),
-        0,
-    )
-    assert summary["per_object"]["1"]["n"] == 3
+    known = {"n": 4, "failed": 1, "acc_15_deg": 1 / 4, "acc_30_deg": 2 / 4}
+    check_values(summary, med_err_deg=degrees(100), **known)
+    check_values(summary["per_object"]["2"], acc_30_deg=0)
+    check_values(summary["per_object"]["1"], n=3)
     # MSSD in diameters: 0.04, then twice 35.4 / 86.6, miss, then hypot(2 * 35.4 sin 10 deg / 86.6,
     # 0.04) = 0.147
     assert summary["mssd_ar"] == pytest.approx((1.0 + 0.0 + 0.0 + 0.8) / 4)
@@ -155,10 +166,8 @@ def test_bop_summary(instances, tmp_path):
     assert summary["add_recall_0.1d"] == 1 / 4
     # MSPD: 300 / 375 * 3.5 = 2.8 px of 80, which are 22.4 of 640: six of the thresholds 5, 10, ...,
     # 50 px (relative to the height of 60 px, five); about 100 px, miss, about 9 px
-    assert (summary["mspd_ar"], summary["subsets"]["unoccluded"]["n"]) == (
-        pytest.approx(0.6 / 4),
-        0,
-    )
+    assert summary["mspd_ar"] == pytest.approx(0.6 / 4)
+    check_values(summary["subsets"]["unoccluded"], n=0)
 
 
 def test_bop_table(instances, tmp_path):
@@ -198,13 +207,11 @@ def test_pose_folders_score_known_poses(web):
     assert errors["error_deg"][[0, 2]].tolist() == pytest.approx([0, 180], abs=0.1)
     assert errors["error_deg"].isnan().tolist() == [False, True, False, True]
     summary = benchmark.summary(benchmark.samples, rows, errors)
-    assert (summary["n"], summary["n_posed"], summary["reliable"]) == (4, 2, 1)
-    assert (summary["acc_30_deg"], summary["mean_confidence"]) == (0.5, 0.375)
-    assert summary["per_object"]["cup"]["mean_confidence"] == 0.5
-    assert summary["per_object"]["shoe"] == {
-        "n": 1, "n_posed": 0, "reliable": 0, "mean_confidence": 0.0,
-        "acc_15_deg": None, "acc_30_deg": None, "med_err_deg": None,
-    }  # fmt: skip
+    check_values(summary, n=4, n_posed=2, reliable=1, acc_30_deg=0.5, mean_confidence=0.375)
+    check_values(summary["per_object"]["cup"], mean_confidence=0.5)
+    unposed = {"n": 1, "n_posed": 0, "reliable": 0, "mean_confidence": 0.0}
+    unposed |= dict.fromkeys(("acc_15_deg", "acc_30_deg", "med_err_deg"))
+    assert summary["per_object"]["shoe"] == unposed
     assert benchmark.errors(benchmark.samples[:1], [FAILED])["error_deg"].tolist() == [torch.inf]
     unknown = [*rows[:2], {**rows[2], "confidence": None}, FAILED]
     assert benchmark.summary(benchmark.samples, unknown, errors)["mean_confidence"] is None
@@ -228,8 +235,8 @@ def test_without_a_box_any_copy_of_the_object_is_right(bop, tmp_path):
     found = {**posed(second, 0), **located(AWAY, around)}
     found["inputs"] = {"picture": PICTURE, "box": around}
     summary = scores_of(benchmark, tmp_path, [found, FAILED, found, FAILED])
-    assert (summary["acc_15_deg"], summary["mssd_ar"], summary["mspd_ar"]) == (0.5, 0.5, 0.5)
-    assert summary["detection"] == {"n": 4, "recall_1": 0.0, "recall_5": 0.5, "recall_20": 0.5}
+    recall = {"n": 4, "recall_1": 0.0, "recall_5": 0.5, "recall_20": 0.5}
+    check_values(summary, acc_15_deg=0.5, mssd_ar=0.5, mspd_ar=0.5, detection=recall)
     assert copy_shown([first, second], FAILED) is first
     beside = {**found, "inputs": {"box": [75.0, 0.0, 79.0, 4.0]}}
     assert copy_shown([first, second], beside) is first
@@ -273,10 +280,10 @@ def test_detection_recall_counts_the_first_right_proposal():
 
 @MATS_HERE
 def test_the_page_marks_by_the_error_up_to_symmetries(furniture, bop, tmp_path):
-    for benchmark, degrees in ((furniture, 90), (BOPBenchmark(bop, ANY), 180)):
+    for benchmark, angle in ((furniture, 90), (BOPBenchmark(bop, ANY), 180)):
         first = benchmark.samples[0]
-        pose = {"rotation": rotated(first, "z", degrees), "translation": [0.0, 0.0, 500.0]}
-        out = tmp_path / str(degrees)
+        pose = {"rotation": rotated(first, "z", angle), "translation": [0.0, 0.0, 500.0]}
+        out = tmp_path / str(angle)
         scores_of(benchmark, out, [pose, *[SKIPPED] * (len(benchmark.entries) - 1)])
         page = (out / "index.html").read_text()
         assert '<figure class="right">' in page
