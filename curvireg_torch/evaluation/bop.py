@@ -30,8 +30,7 @@ UNOCCLUDED = 0.95  # visible fraction from which an object of a BOP set counts a
 
 
 NO_VSD = (
-    "BOP's AR is the mean of VSD, MSSD and MSPD; VSD needs depth images, which are not used "
-    "here: "
+    "BOP's AR is the mean of VSD, MSSD and MSPD; VSD needs depth images, which are not used here: "
     "ar_rgb is without it"
 )
 

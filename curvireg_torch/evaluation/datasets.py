@@ -197,12 +197,7 @@ def _write_page(
             caption = f"{error:.1f} degrees off, {confidence}"
             rank = 0.0, error
         name = benchmark.entries[i].key
-        picture = thumbnail_of(out, row)
-        shown.append(
-            SheetEntry(
-                number=i + 1, name=name, caption=caption, kind=kind, picture=picture, rank=rank
-            )
-        )
+        shown.append(SheetEntry(i + 1, name, caption, kind, thumbnail_of(out, row), rank))
     known = [error for error in errors.tolist() if not math.isnan(error)]
     right = sum(error < RIGHT_DEG for error in known)
     failed = sum(not has_pose(row) for row in rows)

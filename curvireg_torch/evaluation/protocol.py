@@ -73,15 +73,13 @@ class Protocol:
     def parse(cls, words: Iterable[str], *, pose: str = "upright") -> "Protocol":
         """Parse words KEY=VALUE; ``box=annotated`` is 0, ``box=none`` is None. ``pose`` is the
         default of that key."""
-        values: dict[str, str | float | int | None] = {"pose": pose}
+        values: dict[str, str | float | int | None] = {}
         named = {"annotated": 0.0, "none": None}
-        given: set[str] = set()
         for word in words:
             key, _, value = word.partition("=")
             check_option(key, [f.name for f in fields(cls)], "protocol")
-            if key in given:
+            if key in values:
                 raise InvalidInputError(f"protocol: {key} is given twice; give it once")
-            given.add(key)
             try:
                 if key == "box":
                     values[key] = named[value] if value in named else float(value)
@@ -89,7 +87,7 @@ class Protocol:
                     values[key] = int(value) if key in ("seed", "views") else value
             except ValueError as error:
                 raise InvalidInputError(f"protocol: expected {key}=NUMBER, got {word!r}") from error
-        return cls(**values)  # type: ignore[arg-type]
+        return cls(**{"pose": pose} | values)  # type: ignore[arg-type]
 
     def hint_tolerance(self) -> tuple[str, float]:
         """Kind of the hint and its tolerance in degrees."""

@@ -166,9 +166,8 @@ class RegisterOptions:
     )
     box_format: str | None = _option(
         None,
-        "of --box or of a list's boxes: xyxy, corners in px (default); xywh: corner, width, "
-        "height in px; fractions: "
-        "corners; yolo: centre, width, height in fractions of the picture",
+        "of --box or of a list's boxes: xyxy, corners in px (default); xywh: corner, width, height "
+        "in px; fractions: corners; yolo: centre, width, height in fractions of the picture",
         choices=BOX_FORMATS,
     )
     box_is: str | None = _option(
@@ -188,10 +187,9 @@ class RegisterOptions:
     camera: Any = _option(
         None,
         "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, COLMAP, BOP or "
-        "other tools, whose "
-        "distortion is removed. exif insists on the focal length of the photograph's file "
-        "(default: this one, if it "
-        "has one; else the focal length is estimated, and the distance with it)",
+        "other tools, whose distortion is removed. exif insists on the focal length of the "
+        "photograph's file (default: this one, if it has one; else the focal length is estimated, "
+        "and the distance with it)",
         type=_camera_option,
     )
     mask: Path | None = _option(
@@ -203,9 +201,8 @@ class RegisterOptions:
     start: Path | None = _option(
         None,
         "refine this pose; needs no box: result.json, or JSON with rotation and translation or "
-        "T_cam_from_model, 4 x 4 "
-        "numbers, TWO of MegaPose, scene_gt.json:IMAGE_ID of BOP; in the mesh's unit where the "
-        "format has none",
+        "T_cam_from_model, 4 x 4 numbers, TWO of MegaPose, scene_gt.json:IMAGE_ID of BOP; in the "
+        "mesh's unit where the format has none",
         type=Path,
     )
     start_convention: str | None = _option(
@@ -218,8 +215,7 @@ class RegisterOptions:
     unit: str | None = _option(
         None,
         "of the mesh file, and of lengths in and out (default: that which the file states, as "
-        "STEP, IGES, 3MF, Collada, USD "
-        "and URDF do; else m; for a BOP scene mm)",
+        "STEP, IGES, 3MF, Collada, USD and URDF do; else m; for a BOP scene mm)",
         choices=sorted(UNITS),
     )
     link: str | None = _option(
@@ -235,8 +231,8 @@ class RegisterOptions:
     pose: str | None = _option(
         None,
         "any: no assumption. upright: the mesh's up axis points up in the photograph and the "
-        "object is seen from 10 "
-        "degrees below to 60 above; faster, and right more often where it is true (default: any)",
+        "object is seen from 10 degrees below to 60 above; faster, and right more often where it "
+        "is true (default: any)",
         choices=("any", "upright"),
     )
     up: str | None = _option(
@@ -247,16 +243,14 @@ class RegisterOptions:
     mesh_is: str | None = _option(
         None,
         "exact: the mesh of this very object. similar: of another one of its kind; answers are "
-        "then less certain "
-        "(default: exact)",
+        "then less certain (default: exact)",
         choices=MESH_KINDS,
     )
     preset: str | None = _option(
         None,
         "learned: with networks, the most accurate. classical: nothing learned. fast: the best "
-        "view, without "
-        f"contour fit. paper: the published method, to the letter (default: that of a bank, else "
-        f"{DEFAULT})",
+        "view, without contour fit. paper: the published method, to the letter (default: that of "
+        f"a bank, else {DEFAULT})",
         choices=PRESET_NAMES,
     )
     pipeline: Path | None = _option(None, "JSON of a pipeline, instead of --preset", type=Path)

@@ -32,8 +32,7 @@ from .result_files import RegisteredViews
 QUATERNION = ("qw", "qx", "qy", "qz")
 COLUMNS = (
     f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or "
-    f"{' '.join(QUATERNION)}, "
-    f"tx ty tz"
+    f"{' '.join(QUATERNION)}, {' '.join(TRANSLATION)}"
 )
 
 
