@@ -20,6 +20,11 @@ def check_values(document, **expected):
         assert found == value, f"{name}: {found}"
 
 
+def check_columns(rows, **expected):
+    """Check these columns of a table, as :func:`check_values`."""
+    check_values({name: [row[name] for row in rows] for name in expected}, **expected)
+
+
 def _value(cell):
     with suppress(ValueError):
         return json.loads(cell)

@@ -98,20 +98,16 @@ def test_objects_of_bop_sets_are_classes_and_those_without_a_box_are_counted(tmp
         cropped[0]
 
 
-def test_numbers_of_objects_are_ordered_by_value(tmp_path):
-    write_bop(tmp_path)
-    dataset = BOPDataset(tmp_path, targets=False)
-    for item, number in zip(dataset._items, (10, 9, 100, 9), strict=False):
+def test_numbers_of_objects_are_ordered_by_value(bop):
+    for item, number in zip(bop._items, (10, 9, 100, 9), strict=False):
         item["obj_id"] = number
-    assert crops(dataset, 16).classes == ["9", "10", "100"]
+    assert crops(bop, 16).classes == ["9", "10", "100"]
 
 
-def test_unknown_poses_have_no_bin(tmp_path):
-    write_web(tmp_path)
-    dataset = PoseFolder(tmp_path)
-    known = [not bool(dataset.annotation(i)["rotation"].isnan().any()) for i in range(len(dataset))]
+def test_unknown_poses_have_no_bin(web):
+    known = [bool(web.annotation(i)["rotation"].isfinite().all()) for i in range(len(web))]
     assert known.count(False) == 2
-    for crop, pose in zip(crops(dataset, 16), known, strict=True):
+    for crop, pose in zip(crops(web, 16), known, strict=True):
         assert (crop["viewpoint_bins"] >= 0).tolist() == [pose] * 3
     logits = torch.zeros(2, 24)
     ignored = torch.tensor([3, UNKNOWN_CLASS])

@@ -7,6 +7,7 @@ from curvireg_torch.data import Video
 from curvireg_torch.data.frames import FrameReader
 from curvireg_torch.errors import CurviregWarning, ImageError
 from tests._support import refused
+from tests._support.spies import spied
 
 
 @pytest.fixture(scope="module")
@@ -77,18 +78,15 @@ def test_video_refuses_playlists_other_files_and_too_many_pixels(five, tmp_path,
 
 
 def test_frame_reader_decodes_once_for_numbers_in_order(five, monkeypatch):
-    opened = []
-    original = Video.__iter__
-    monkeypatch.setattr(Video, "__iter__", lambda self: opened.append(self.every) or original(self))
     frames = dict(Video(five))
-    opened.clear()
+    opened = spied(monkeypatch, Video, "__iter__")
     reader = FrameReader(five)
     for number in (0, 1, 3, 4):
         assert torch.equal(reader.read(number), frames[number])
-    assert opened == [1]
+    assert len(opened) == 1
     for _ in range(2):
         assert torch.equal(reader.read(0), frames[0]), "again from the start"
-    assert opened == [1, 1, 1]
+    assert len(opened) == 3
     assert torch.equal(FrameReader(five, every=3).read(3), frames[3])
     with refused(r"five\.avi: no frame 9", ImageError):
         reader.read(9)

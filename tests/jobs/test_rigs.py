@@ -41,7 +41,7 @@ def images(tmp_path):
 def rig(tmp_path):
     """Write rows of a rig, beside its camera, and read it."""
     (tmp_path / "cameras.txt").write_text(LINE)
-    return lambda header, row: read_rig(written(tmp_path / "rig.csv", header, row))
+    return lambda header, *rows: read_rig(written(tmp_path / "rig.csv", header, *rows))
 
 
 NAMES = ("a{many}b.png", "{many}", "a{many}", "a/{many}/b")
@@ -72,7 +72,7 @@ def test_a_name_of_colmap_keeps_its_inner_blanks(tmp_path, images):
             read_rig(tmp_path)
 
 
-def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path, monkeypatch):
+def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path, rig, monkeypatch):
     read = spied(monkeypatch, calibrations, "read_document")
 
     def check_read(*names):
@@ -83,7 +83,7 @@ def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path
     (tmp_path / "b.json").write_text(json.dumps(CALIBRATION))
     names = [*(f"a.json:c{k}" for k in range(5)), "b.json", "b.json"]
     rows = [[f"{k}.png", name, *POSE] for k, name in enumerate(names)]
-    assert len(read_rig(written(tmp_path / "rig.csv", COLUMNS, *rows))) == 7
+    assert len(rig(COLUMNS, *rows)) == 7
     check_read("a.json", "b.json")
     rows = [[f"{k}.png", 0, 0, 9, 9, name] for k, name in enumerate(names)]
     photos = written(tmp_path / "list.csv", "photo,x0,y0,x1,y1,camera", *rows)
@@ -98,13 +98,13 @@ def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path
     check_read("cameras.txt")
 
 
-def test_rigs_and_lists_are_bounded(tmp_path, monkeypatch):
+def test_rigs_and_lists_are_bounded(tmp_path, rig, monkeypatch):
     monkeypatch.setattr(rigs, "MAX_RIG_VIEWS", 2)
     (tmp_path / "b.json").write_text(json.dumps(CALIBRATION))
     rows = [[f"{k}.png", "b.json", *POSE] for k in range(3)]
-    assert len(read_rig(written(tmp_path / "rig.csv", COLUMNS, *rows[:2]))) == 2
+    assert len(rig(COLUMNS, *rows[:2])) == 2
     with refused(r"rig\.csv: more than 2 photographs; leave some out"):
-        read_rig(written(tmp_path / "rig.csv", COLUMNS, *rows))
+        rig(COLUMNS, *rows)
     options = RegisterOptions(meshes=(tmp_path / "a.ply",))
     header = "photo,x0,y0,x1,y1" + "".join(f",c{k}" for k in range(MAX_LIST_COLUMNS - 5))
     row = ["a.png", *[""] * (MAX_LIST_COLUMNS - 1)]

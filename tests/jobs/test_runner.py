@@ -45,9 +45,10 @@ def entries(tmp_path, threads):
 HOW = {"settings": {}, "label": "", "progress": False}
 
 
-def registered(entries, folder, *, stop_after=None, **how):
-    """The labels of the entries that a run registers, in their order; Ctrl-C after ``stop_after``
-    of them."""
+def registered(entries, *, stop_after=None, **how):
+    """The labels of the entries that a run registers, in their order, into a folder beside their
+    photographs; Ctrl-C after ``stop_after`` of them."""
+    folder = entries[0].photo.parent / "out"
     labels = []
     opened = []
 
@@ -77,10 +78,10 @@ def registered(entries, folder, *, stop_after=None, **how):
     return labels
 
 
-def test_entries_of_one_mesh_follow_each_other(entries, tmp_path):
-    assert registered(entries, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
-    assert registered(entries, tmp_path / "out") == []
-    assert registered(entries[::-1], tmp_path / "out") == [], "in any order"
+def test_entries_of_one_mesh_follow_each_other(entries):
+    assert registered(entries) == ["0a", "1a", "0b", "1b"]
+    assert registered(entries) == []
+    assert registered(entries[::-1]) == [], "in any order"
 
 
 AGAIN = {
@@ -94,21 +95,20 @@ AGAIN = {
 
 @pytest.mark.parametrize(("name", "again"), AGAIN.items())
 def test_changed_files_are_registered_again(entries, tmp_path, name, again):
-    registered(entries, tmp_path / "out")
+    registered(entries)
     (tmp_path / name).write_text((tmp_path / name).read_text() + "\n# changed\n")
-    assert registered(entries, tmp_path / "out") == again.split()
-    assert registered(entries, tmp_path / "out") == []
+    assert registered(entries) == again.split()
+    assert registered(entries) == []
 
 
-def test_other_requests_settings_and_code_are_registered_again(entries, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    registered(entries, out)
+def test_other_requests_settings_and_code_are_registered_again(entries, monkeypatch):
+    registered(entries)
     changed = [replace(entries[0], box=(1.0, 2.0, 3.0, 4.0)), *entries[1:]]
-    assert registered(changed, out) == ["0a"]
+    assert registered(changed) == ["0a"]
     for count in (4, 0):
-        assert len(registered(changed, out, settings={"hypotheses": 2})) == count
+        assert len(registered(changed, settings={"hypotheses": 2})) == count
     monkeypatch.setattr(runner, "results_digest", lambda: "newer")
-    assert len(registered(changed, out, settings={"hypotheses": 2})) == 4
+    assert len(registered(changed, settings={"hypotheses": 2})) == 4
 
 
 @pytest.mark.parametrize(
@@ -128,24 +128,24 @@ def test_rows_of_other_code_are_registered_again(changed, count, entries, tmp_pa
         write_file(package / name, b"x = 1")
     monkeypatch.setattr(sources, "PACKAGE", package)
     sources.package_digest.cache_clear()
-    registered(entries, tmp_path / "out")
+    registered(entries)
     write_file(package / changed, b"x = 2")
     sources.package_digest.cache_clear()
-    assert len(registered(entries, tmp_path / "out")) == count
+    assert len(registered(entries)) == count
     monkeypatch.undo()
     sources.package_digest.cache_clear()
 
 
-def test_missing_photographs_are_tried_again(entries, tmp_path):
+def test_missing_photographs_are_tried_again(entries):
     entries[0].photo.unlink()
-    assert registered(entries, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
-    assert registered(entries, tmp_path / "out") == ["0a", "0b"]
+    assert registered(entries) == ["0a", "1a", "0b", "1b"]
+    assert registered(entries) == ["0a", "0b"]
     assert registered.store.read("0a")["digests"]["photo"] == ""
 
 
-def test_interrupted_run_keeps_what_is_done(entries, tmp_path):
-    assert registered(entries, tmp_path / "out", stop_after=2) == ["0a", "1a"]
-    assert registered(entries, tmp_path / "out") == ["0b", "1b"]
+def test_interrupted_run_keeps_what_is_done(entries):
+    assert registered(entries, stop_after=2) == ["0a", "1a"]
+    assert registered(entries) == ["0b", "1b"]
 
 
 def test_textures_of_another_folder_are_digested(entries, tmp_path):
@@ -155,12 +155,11 @@ def test_textures_of_another_folder_are_digested(entries, tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "skin.png").write_text("red")
     one, two = ([tmp_path / name] for name in ("one", "two"))
-    out = tmp_path / "out"
-    assert len(registered(entries, out, textures=one)) == 4
-    assert registered(entries, out, textures=two) == []
+    assert len(registered(entries, textures=one)) == 4
+    assert registered(entries, textures=two) == []
     (tmp_path / "one" / "skin.png").write_text("blue")
-    assert registered(entries, out, textures=one) == ["0b", "1b"]
-    assert registered(entries, out, textures=one) == []
+    assert registered(entries, textures=one) == ["0b", "1b"]
+    assert registered(entries, textures=one) == []
 
 
 def test_only_photographs_with_a_row_are_digested_before_they_are_registered(
@@ -197,7 +196,7 @@ def test_a_video_is_digested_once_for_the_frames_of_a_block(entries, monkeypatch
     digest.assert_called_once_with(entries[0].photo)
 
 
-def test_a_photograph_that_ends_its_worker_fails_and_is_tried_again(entries, tmp_path):
+def test_a_photograph_that_ends_its_worker_fails_and_is_tried_again(entries):
     """The others keep their rows."""
 
     class OneLost(Workers):
@@ -206,11 +205,11 @@ def test_a_photograph_that_ends_its_worker_fails_and_is_tried_again(entries, tmp
                 is_lost = task.entry.label == "1a"
                 yield task, WorkerError("workers: a process ended") if is_lost else result
 
-    assert len(registered(entries, tmp_path / "out", workers=OneLost())) == 4
+    assert len(registered(entries, workers=OneLost())) == 4
     row = registered.store.read("1a")
     assert (row["verdict"], row["message"]) == ("failed", "workers: a process ended")
     assert row["seconds"] == {"bank": 0.0, "register": 0.0}
-    assert registered(entries, tmp_path / "out") == ["1a"]
+    assert registered(entries) == ["1a"]
 
 
 @pytest.mark.parametrize(("error", "tries"), [(MissingDependencyError, 2), (MeshError, 1)])
@@ -240,10 +239,10 @@ def test_a_missing_photograph_beside_others_is_tried_again(entries, tmp_path):
     gone = replace(VIEWS[0], photo=tmp_path / "gone.png")
     rig = [replace(entries[0], views=(gone,)), replace(entries[2], views=(gone,))]
     for _ in range(2):
-        assert registered(rig, tmp_path / "out") == ["0a", "1a"]
+        assert registered(rig) == ["0a", "1a"]
     gone.photo.write_text("found again")
     for labels in (["0a", "1a"], []):
-        assert registered(rig, tmp_path / "out") == labels
+        assert registered(rig) == labels
 
 
 CAMERA = Camera(torch.eye(3))
