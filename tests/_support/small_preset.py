@@ -12,6 +12,12 @@ def banks(tmp_path_factory):
     return tmp_path_factory.mktemp("banks")
 
 
+@pytest.fixture
+def out(tmp_path):
+    """The folder of the results, which does not exist yet."""
+    return tmp_path / "out"
+
+
 @pytest.fixture(autouse=True)
 def _small(monkeypatch, banks):
     monkeypatch.setitem(PRESETS, DEFAULT, SMALL)

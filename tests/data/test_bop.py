@@ -9,7 +9,7 @@ from torch.testing import assert_close
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import MissingFileError
 from tests._support import refused
-from tests._support.miniature import write_bop, write_mesh
+from tests._support.miniature import write_bop, write_json, write_mesh
 from tests._support.tables import check_values, text_table
 
 
@@ -38,7 +38,7 @@ def edit(root, name, change):
     path = root / "test" / "000001" / name
     content = json.loads(path.read_text())
     change(content)
-    path.write_text(json.dumps(content))
+    write_json(path, content)
 
 
 def ids(dataset):
@@ -110,7 +110,7 @@ def test_each_target_that_cannot_be_used_is_counted_once(root):
     names = ("scene_id", "im_id", "obj_id", "inst_count")
     targets = [(1, *key, count) for key, count in objects.items()]
     content = [dict(zip(names, target, strict=True)) for target in targets]
-    (root / "test_targets_bop19.json").write_text(json.dumps(content))
+    write_json(root / "test_targets_bop19.json", content)
     dataset = BOPDataset(root)
     assert ids(dataset) == ALL[:3:2]
     skipped = dataset.skipped_items

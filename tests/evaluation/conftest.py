@@ -1,1 +1,1 @@
-from tests._support.small_preset import _small, banks  # noqa: F401
+from tests._support.small_preset import _small, banks, out  # noqa: F401

@@ -15,16 +15,16 @@ from curvireg_torch.evaluation import compare as module
 from curvireg_torch.evaluation.compare import compare, in_words, read_run
 from tests._support import refused
 from tests._support.lists import written
+from tests._support.miniature import write_json
 
 
 def write_run(
     folder, errors, dataset="pascal3d", columns=("error_deg", "symmetric_error_deg"), **settings
 ):
     """Write a run with errors in degrees by key."""
-    folder.mkdir()
     settings = {"dataset": dataset, "root": "set", "split": "val", "preset": "learned", **settings}
     summary = {"settings": settings, "protocol": "cad=annotated"}
-    (folder / "summary.json").write_text(json.dumps(summary))
+    write_json(folder / "summary.json", summary)
     rows = [[key, "car", *([value] * len(columns))] for key, value in errors.items()]
     written(folder / "errors.csv", ",".join(("key", "group", *columns)), *rows)
     return folder

@@ -1,6 +1,5 @@
 """Scores of results that are written by hand, so that every number is known."""
 
-import json
 import math
 
 import pytest
@@ -15,7 +14,13 @@ from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_view
 from curvireg_torch.jobs.store import ResultStore, to_json
 from tests._support import double, refused
 from tests._support.lists import bop_poses, table
-from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
+from tests._support.miniature import (
+    pascal_object,
+    write_image,
+    write_json,
+    write_mesh,
+    write_record,
+)
 from tests._support.tables import check_columns, check_values, text_table
 
 MATS_HERE = pytest.mark.usefixtures("mats_here")
@@ -216,10 +221,8 @@ def test_pose_folders_score_known_poses(web):
 
 @pytest.mark.filterwarnings("ignore:views=2")
 def test_detection_is_scored_in_single_photographs(bop, tmp_path):
-    for views in (1, 2):
-        benchmark = BOPBenchmark(bop, Protocol(pose="any", box=None, views=views))
-        summary = scores_of(benchmark, tmp_path / str(views), [FAILED] * 4)
-        assert ("detection" in summary) == (views == 1)
+    benchmark = BOPBenchmark(bop, Protocol(pose="any", box=None, views=2))
+    assert "detection" not in scores_of(benchmark, tmp_path, [FAILED] * 4)
 
 
 def test_without_a_box_any_copy_of_the_object_is_right(bop, tmp_path):
@@ -328,7 +331,7 @@ def test_bop_errors_are_of_the_models_of_the_challenge(instances, tmp_path):
     models = scores_of(enlarged, tmp_path / "some", rows)["models"]
     assert models == {"models_eval": [1], "models": [2]}
     info = {"1": {"diameter": 2 * samples[0]["model_info"]["diameter"]}}
-    (root / "models_eval" / "models_info.json").write_text(json.dumps(info))
+    write_json(root / "models_eval" / "models_info.json", info)
     doubled = BOPBenchmark(benchmark.dataset, benchmark.protocol).errors(samples, rows)
     torch.testing.assert_close(doubled["mssd"][first], found["mssd"][first] / 2)
     half = [posed(s, 180) for s in samples]
@@ -337,16 +340,16 @@ def test_bop_errors_are_of_the_models_of_the_challenge(instances, tmp_path):
 
 
 @pytest.mark.parametrize(("folder", "name"), [("lm", "lm"), ("my-own_set", "myownset")])
-def test_results_have_the_name_that_the_toolkit_takes_apart(bop, tmp_path, folder, name):
+def test_results_have_the_name_that_the_toolkit_takes_apart(bop, tmp_path, out, folder, name):
     benchmark = BOPBenchmark(bop, ANY)
     bop.root = tmp_path / folder
     bop.split = "test_primesense"
-    (tmp_path / "out").mkdir()
-    store = ResultStore(tmp_path / "out")
+    out.mkdir()
+    store = ResultStore(out)
     report(benchmark, store, {"root": "x", "protocol": "", "preset": "fast"}, 0)
-    (file,) = (tmp_path / "out").glob("*_*.csv")
+    (file,) = out.glob("*_*.csv")
     assert file.name == f"curvireg-fast_{name}-test-primesense.csv"
-    assert file.read_bytes() == (tmp_path / "out" / "predictions.csv").read_bytes()
+    assert file.read_bytes() == (out / "predictions.csv").read_bytes()
 
 
 def test_an_object_that_is_visible_by_95_per_cent_is_unoccluded(instances):

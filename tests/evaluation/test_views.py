@@ -98,7 +98,7 @@ def test_poses_of_the_cameras_come_first(trucks):
     path = trucks.root / "test" / "000001" / "scene_gt.json"
     content = json.loads(path.read_text())
     content["0"][0]["cam_t_m2c"][2] *= 1.001
-    path.write_text(json.dumps(content))
+    write_json(path, content)
     benchmark = BOPBenchmark(BOPDataset(trucks.root), Protocol(pose="any", views=4))
     truths = [photograph_in_mm(azimuth)[2] for azimuth in (30.0, 70.0, 110.0, 150.0)]
     for view in benchmark.entries[0].views:
@@ -129,16 +129,16 @@ def test_instances_are_told_apart_by_their_place():
 
 
 @pytest.mark.slow
-def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
+def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, out):
     benchmark = BOPBenchmark(trucks, Protocol(pose="any", views=3))
     broken = trucks.root / "test" / "000002" / "rgb" / "000003.png"
     broken.write_bytes(b"no picture")
-    summary = run(benchmark, tmp_path / "out")
+    summary = run(benchmark, out)
     protocol = "cad=annotated pose=any box=annotated views=3 seed=0"
     skipped = {"unreadable_image": 1}
     check_values(summary, protocol=protocol, n=7, failed=0, skipped=skipped)
     failures = Counter()
-    for row in rows_of(benchmark, tmp_path / "out").values():
+    for row in rows_of(benchmark, out).values():
         if row["verdict"] == "failed":
             continue
         first, _, _ = row["photographs"]
@@ -149,4 +149,4 @@ def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
     drawn = sum(view.photo == broken for entry in others for view in entry.views)
     assert failures[True] >= drawn > 0, "a photograph that cannot be read does not spoil the others"
     assert summary["acc_30_deg"] > 0.5
-    assert not run(benchmark, tmp_path / "out")["failed"]
+    assert not run(benchmark, out)["failed"]

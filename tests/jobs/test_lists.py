@@ -58,11 +58,6 @@ def entry(tmp_path):
 
 
 @pytest.fixture
-def out(tmp_path):
-    return tmp_path / "out"
-
-
-@pytest.fixture
 def register_rows(registrar, out):
     """Register rows; results go to ``out``."""
 

@@ -1,6 +1,5 @@
 """What reading a rig or a list costs; tests/cli/test_views.py checks what is read."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from curvireg_torch.utils.files import only_in
 from tests._support import double, eye, refused
 from tests._support.doubling import check_linear
 from tests._support.lists import written
+from tests._support.miniature import write_json
 from tests._support.spies import spied
 
 POSE = [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1]
@@ -79,8 +79,8 @@ def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path
         assert sorted(file.name for (file,) in read) == [*names]
         read.clear()
 
-    (tmp_path / "a.json").write_text(json.dumps({f"c{k}": CALIBRATION for k in range(5)}))
-    (tmp_path / "b.json").write_text(json.dumps(CALIBRATION))
+    write_json(tmp_path / "a.json", {f"c{k}": CALIBRATION for k in range(5)})
+    write_json(tmp_path / "b.json", CALIBRATION)
     names = [*(f"a.json:c{k}" for k in range(5)), "b.json", "b.json"]
     rows = [[f"{k}.png", name, *POSE] for k, name in enumerate(names)]
     assert len(rig(COLUMNS, *rows)) == 7
@@ -100,7 +100,7 @@ def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path
 
 def test_rigs_and_lists_are_bounded(tmp_path, rig, monkeypatch):
     monkeypatch.setattr(rigs, "MAX_RIG_VIEWS", 2)
-    (tmp_path / "b.json").write_text(json.dumps(CALIBRATION))
+    write_json(tmp_path / "b.json", CALIBRATION)
     rows = [[f"{k}.png", "b.json", *POSE] for k in range(3)]
     assert len(rig(COLUMNS, *rows[:2])) == 2
     with refused(r"rig\.csv: more than 2 photographs; leave some out"):
@@ -186,7 +186,7 @@ CAMERA = {"cam_K": K, "cam_R_w2c": EYE, "cam_t_w2c": [0.0, 0.0, 600.0]}
 
 def write_scene(folder, **parts):
     for name, content in parts.items():
-        (folder / f"scene_{name}.json").write_text(json.dumps(content))
+        write_json(folder / f"scene_{name}.json", content)
 
 
 @pytest.mark.parametrize("truth", [{"obj_id": 5}, [5], ["obj_id"], "obj_id"])
