@@ -58,14 +58,11 @@ def test_hint_of_truth_holds_the_truth_and_is_off_centre(hint):
     assert first == again != other
 
 
-def test_a_seed_that_draws_nothing_is_refused():
+def test_a_seed_that_draws_nothing_and_a_key_that_is_given_twice_are_refused():
     with refused("protocol: seed: nothing is drawn"):
         Protocol.parse(["seed=3"])
     for word in ("box=0.1", "hint=pose:5", "views=2"):
         assert Protocol.parse([word, "seed=3"]).seed == 3
-
-
-def test_a_key_that_is_given_twice_is_refused():
     with refused("protocol: box is given twice"):
         Protocol.parse(["box=0.1", "box=0.2"])
 

@@ -225,9 +225,8 @@ def test_detection_is_scored_in_single_photographs(bop, tmp_path):
     assert "detection" not in scores_of(benchmark, tmp_path, [FAILED] * 4)
 
 
-def test_without_a_box_any_copy_of_the_object_is_right(bop, tmp_path):
-    benchmark = BOPBenchmark(bop, Protocol(pose="any", box=None))
-    first, other, second, _ = benchmark.samples
+def test_without_a_box_any_copy_of_the_object_is_right(instances, tmp_path):
+    benchmark, (first, other, second, _) = instances
     second["box"] = torch.tensor([50.0, 30.0, 70.0, 50.0])
     second["rotation"] = first["rotation"][[1, 2, 0]]
     assert benchmark.copies([second, other]) == [[second, first], [other]]

@@ -138,17 +138,6 @@ def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
     assert entry.box == (1.0, 2.0, 30.0, 40.0)
 
 
-def test_a_panorama_needs_its_camera(entry):
-    wide = replace(read_photo(entry.photo), is_stitched=True)
-    for camera in (None, "exif"):
-        with refused(r"a panorama, .* ordinary photograph") as e:
-            camera_of(replace(entry, camera=camera), wide)
-        assert e.value.kind == "camera"
-    assert camera_of(replace(entry, camera=CAMERA), wide)[0] is CAMERA
-    assert camera_of(replace(entry, camera=50.0), wide)[1] == "fov"
-    assert camera_of(replace(entry, as_stored=True), wide) == (None, None)  # of a dataset
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -200,14 +189,24 @@ FILES = [(replace(CAMERA, size=SIZE), "file"), (LENS, "file")]
 @pytest.mark.parametrize(
     ("camera", "source"), [(CAMERA, "given"), *FILES, (50.0, "fov"), ("exif",) * 2, (None, "exif")]
 )
-def test_camera_of_names_its_source(entry, monkeypatch, camera, source):
+def test_camera_of_names_its_source_and_a_panorama_needs_its_camera(
+    entry, monkeypatch, camera, source
+):
     photo = read_photo(entry.photo)
-    assert camera_of(replace(entry, camera=None), photo) == (None, None), "without EXIF data"
+    assert camera_of(entry, photo) == (None, None), "without EXIF data"
     monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: CAMERA.matrix)
-    found, name = camera_of(replace(entry, camera=camera), photo)
+    wide = replace(photo, is_stitched=True)
+    known = replace(entry, camera=camera)
+    found, name = camera_of(known, photo)
     assert (name, found.source) == (source, "exif" if source == "exif" else "given")
-    stored = replace(entry, camera=None, as_stored=True)
-    assert camera_of(stored, photo) == (None, None), "of a dataset"
+    if source != "exif":
+        assert camera_of(known, wide)[1] == source
+    else:
+        with refused(r"a panorama, .* ordinary photograph") as e:
+            camera_of(known, wide)
+        assert e.value.kind == "camera"
+    for shown in (photo, wide):
+        assert camera_of(replace(entry, as_stored=True), shown) == (None, None), "of a dataset"
 
 
 def test_names_are_in_the_order_of_their_numbers(tmp_path):

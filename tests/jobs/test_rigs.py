@@ -189,26 +189,23 @@ def write_scene(folder, **parts):
         write_json(folder / f"scene_{name}.json", content)
 
 
-@pytest.mark.parametrize("truth", [{"obj_id": 5}, [5], ["obj_id"], "obj_id"])
-def test_ground_truth_of_bop_of_another_shape_is_refused(tmp_path, truth):
-    write_scene(tmp_path, camera={"0": CAMERA}, gt={"0": truth})
-    with refused(r"image 0: expected a list of objects in scene_gt\.json"):
+TRUTHS = ({"obj_id": 5}, [5], ["obj_id"], "obj_id")
+SKEWED = ([*K[:place], 2.0, *K[place + 1 :]] for place in (1, 3, 6))
+NO_POSE = r"no cam_R_w2c in scene_camera\.json.* register these photographs one by one"
+
+
+@pytest.mark.parametrize(
+    ("camera", "truth", "message"),
+    [
+        *((CAMERA, truth, r"expected a list of objects in scene_gt\.json") for truth in TRUTHS),
+        ({"cam_K": K}, [], NO_POSE),
+        *(({**CAMERA, "cam_K": matrix}, [], r"cam_K in scene_camera\.json") for matrix in SKEWED),
+    ],
+)
+def test_scenes_of_bop_that_are_no_rig_are_refused(tmp_path, camera, truth, message):
+    write_scene(tmp_path, camera={"7": camera}, gt={"7": truth})
+    with refused(f"image 7: {message}"):
         read_rig(tmp_path, Path("obj_000005.ply"))
-
-
-def test_a_scene_of_bop_without_poses_of_its_cameras_is_no_rig(tmp_path):
-    write_scene(tmp_path, camera={"7": {"cam_K": K}})
-    message = r"image 7: no cam_R_w2c in scene_camera\.json.* register these photographs one by one"
-    with refused(message):
-        read_rig(tmp_path)
-
-
-@pytest.mark.parametrize("place", [1, 3, 6])
-def test_cameras_of_bop_with_skew_are_refused(tmp_path, place):
-    skewed = [*K[:place], 2.0, *K[place + 1 :]]
-    write_scene(tmp_path, camera={"0": {**CAMERA, "cam_K": skewed}})
-    with refused(r"image 0: cam_K in scene_camera\.json"):
-        read_rig(tmp_path)
 
 
 def test_a_photograph_of_colmap_whose_name_is_a_number_is_no_line_of_points(tmp_path, images):
