@@ -7,14 +7,9 @@ import torch
 
 from curvireg_torch.evidence import RANK_ALONE, Evidence, EvidenceWeights
 from tests._support import double, refused
+from tests._support.hypotheses import evidence_of
 
 NAMES = [field.name for field in fields(Evidence)]
-
-
-def evidence(count=3, **columns):
-    values = {name: double(column) for name, column in columns.items()}
-    nothing = torch.zeros(count, dtype=torch.float64)
-    return Evidence(**{name: values.get(name, nothing) for name in NAMES})
 
 
 def test_every_kind_has_a_weight_of_its_name():
@@ -25,20 +20,20 @@ def test_every_kind_has_a_weight_of_its_name():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_score_is_the_weighted_sum(name):
-    weights = EvidenceWeights(**dict.fromkeys(NAMES, 0.0) | {name: 2.0})
-    assert evidence(**{name: [0.5, -1.0, 3.0]}).scores(weights).tolist() == [1.0, -2.0, 6.0]
+    weights = EvidenceWeights.only(**{name: 2.0})
+    assert evidence_of(**{name: [0.5, -1.0, 3.0]}).scores(weights).tolist() == [1.0, -2.0, 6.0]
 
 
 @pytest.mark.parametrize("name", ["rank", "edge_support"])
 def test_how_near_a_view_was_and_support_alone_are_no_evidence_for_a_fitted_pose(name):
     """Else of two poses that fit equally well the one with the nearer view would win by chance."""
-    tied = evidence(2, similarity=[0.7, 0.7], **{name: [0.0, -1.335]})
+    tied = evidence_of(similarity=[0.7, 0.7], **{name: [0.0, -1.335]})
     first, second = tied.scores(EvidenceWeights()).tolist()
     assert first == second
 
 
 def test_a_similar_mesh_keeps_the_order_of_the_ranking():
-    seen = evidence(rank=[-1.0, -2.0, 0.0], **{name: [5.0, 4.0, 3.0] for name in NAMES[1:]})
+    seen = evidence_of(rank=[-1.0, -2.0, 0.0], **{name: [5.0, 4.0, 3.0] for name in NAMES[1:]})
     assert seen.scores(RANK_ALONE).tolist() == [-1.0, -2.0, 0.0]
 
 
@@ -63,22 +58,18 @@ def test_evidence_is_read_from_poses():
 
 
 def test_photographs_are_averaged_by_weight():
-    both = Evidence.stack([evidence(1, details=[1.0]), evidence(1, details=[4.0])])
+    both = Evidence.stack([evidence_of(details=[1.0]), evidence_of(details=[4.0])])
     mean = both.mean(double([2.0, 1.0]))
     assert mean.details.tolist() == [2.0]
     assert mean.rank.tolist() == [0.0]
 
 
 def test_many_keypoints_outweigh_what_an_occluder_takes_away_and_one_does_not():
-    similarity = [0.4, 0.1, 0.8, 0.6]
-    contours = [0.3, 0.1, 0.5, 0.3]
-    keypoints = torch.tensor([0.0, 20.0, 0.0, 1.0]).log1p().tolist()
-    four = evidence(
-        4,
-        similarity=similarity,
-        contours=contours,
+    four = evidence_of(
+        similarity=[0.4, 0.1, 0.8, 0.6],
+        contours=[0.3, 0.1, 0.5, 0.3],
         appearance=[0.0, -4.0, 0.0, -0.5],
-        keypoints=keypoints,
+        keypoints=torch.tensor([0.0, 20.0, 0.0, 1.0]).log1p().tolist(),
     )
     order = four.scores(EvidenceWeights()).argsort(descending=True)
     assert order.tolist() == [2, 3, 1, 0]

