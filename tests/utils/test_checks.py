@@ -34,15 +34,13 @@ BAD_CAMERAS = {
 }
 
 
+POINT = double([[0.0, 0.0, 0.0]])
+
+
 @pytest.mark.parametrize("bad", BAD_CAMERAS)
-def test_check_camera_matrix_refuses_what_is_no_camera(bad):
-    checks.check_camera_matrix(CAMERA)
-    for call in (
-        checks.check_camera_matrix,
-        lambda K: cr.project_points(torch.zeros(1, 3).double(), POSE, K),
-    ):
-        with refused("camera matrix: expected"):
-            call(BAD_CAMERAS[bad])
+def test_what_is_no_camera_matrix_is_refused(bad):
+    with refused("camera matrix: expected"):
+        cr.project_points(POINT, POSE, BAD_CAMERAS[bad])
 
 
 R = POSE[:3, :3]
@@ -57,18 +55,12 @@ BAD_ROTATIONS = {
 
 
 @pytest.mark.parametrize("bad", BAD_ROTATIONS)
-def test_check_rotation_and_check_pose_refuse_what_is_not_rigid(bad):
-    for call in (lambda R: checks.check_rotation(R, "R"), lambda R: cr.rotation_error(R, R)):
-        with refused("expected rotations"):
-            call(BAD_ROTATIONS[bad])
-    T = geometry.transform(BAD_ROTATIONS[bad], POSE[:3, 3])
-    point = torch.zeros(1, 3).double()
-    for call in (
-        lambda T: checks.check_pose(T, "T"),
-        lambda T: cr.project_points(point, T, CAMERA),
-    ):
-        with refused("expected rigid"):
-            call(T)
+def test_what_is_not_rigid_is_refused(bad):
+    R = BAD_ROTATIONS[bad]
+    with refused("expected rotations"):
+        cr.rotation_error(R, R)
+    with refused("expected rigid"):
+        cr.project_points(POINT, geometry.transform(R, POSE[:3, 3]), CAMERA)
 
 
 def test_check_pose_refuses_other_rows_and_missing_values():
@@ -134,22 +126,9 @@ def test_as_boxes_and_as_camera_matrices_accept_tensors_arrays_and_lists_only():
     for bad in (*others, np.array([[1, 2, 3, None]]), torch.ones(1, 4, dtype=torch.bool)):
         with refused("boxes: expected"):
             checks.as_boxes(bad, 1)
-    for K in (
-        CAMERA,
-        [CAMERA, CAMERA],
-        [CAMERA.tolist()] * 2,
-        [*CAMERA.expand(2, 3, 3).numpy()],
-        CAMERA.numpy(),
-    ):
+    for K in (CAMERA, [CAMERA.tolist()] * 2):
         assert torch.equal(checks.as_camera_matrices(K, 2), CAMERA.expand(2, 3, 3))
-    for bad in (
-        [None],
-        "camera",
-        [CAMERA, None],
-        [[1.0, 2.0, 3.0]],
-        [CAMERA, CAMERA[:2]],
-        [CAMERA] * 3,
-    ):
+    for bad in ("camera", [[1.0, 2.0, 3.0]], [CAMERA] * 3):
         with refused("camera_matrices: expected"):
             checks.as_camera_matrices(bad, 2)
 

@@ -91,15 +91,12 @@ def test_a_state_is_sent_to_a_worker_once():
 def test_what_is_lost_is_done_again_alone_and_costs_no_other():
     executor = InlineExecutor(ends={4})
     found = dict(Workers(executor=executor).map(doubled, None, [[1, 2], [3, 4, 5], [6]]))
-    assert isinstance(found.pop(4), WorkerError)
+    lost = found.pop(4)
+    assert isinstance(lost, WorkerError)
+    assert str(lost) == "workers: RuntimeError: the worker is gone"
     assert found == {1: 2, 2: 4, 3: 6, 5: 10, 6: 12}
     assert executor.blocks.count([4]) == 2, "three times altogether"
     assert executor.blocks.count([3]) == executor.blocks.count([5]) == 1
-
-
-def test_the_error_names_what_the_worker_said():
-    error = dict(mapped([[1], [2]], ends={2}))[2]
-    assert str(error) == "workers: RuntimeError: the worker is gone"
 
 
 @pytest.mark.parametrize("ends", [{1, 2}, {2, 3, 4, 5, 6}])

@@ -163,28 +163,14 @@ def test_digests_have_as_many_digits_as_they_say():
     assert len(files.tensor_checksum(tensors)) == 8
 
 
-def test_file_name_has_no_folders():
-    assert (file_name("../../etc/passwd"), file_name("C:\\a\\b.png")) == ("passwd", "b.png")
-    assert file_name("a\nb\x1b.png") == "ab.png"
-    assert file_name("") == file_name("a/") == file_name("..") == "file"
-    assert file_name("ä" * 500 + ".png").endswith("ä.png")
-    assert len(file_name("ä" * 500).encode()) < 255
-
-
 def test_only_in_finds_files_of_one_folder(tmp_path):
     find = only_in(tmp_path)
-    for name in (
-        "a.png",
-        "/etc/a.png",
-        "../a.png",
-        "C:\\a.png",
-        "b/../a.png",
-        "\0a.png",
-        " a.png ",
-    ):
+    for name in ("/etc/a.png", "../a.png", "C:\\b\\a.png", "b/../a.png", "\0a\n.png", " a.png "):
         assert find(name) == tmp_path / "a.png"
-    for name in ("", "..", "../..", "/", "x/.", "..\\.."):
+    for name in ("", "..", "../..", "x/.", "..\\.."):
         assert find(name) == tmp_path / "file"
+    assert file_name("ä" * 500 + ".png").endswith("ä.png")
+    assert len(file_name("ä" * 500).encode()) < 255
 
 
 def test_a_csv_file_that_grows_has_each_row_at_once_and_begins_anew(tmp_path):

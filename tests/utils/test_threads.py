@@ -26,21 +26,6 @@ def test_for_each_runs_every_job_once_and_two_at_a_time():
         assert sorted(done) == list(range(6))
 
 
-def test_for_each_stops_at_an_error_and_raises_it():
-    done = []
-
-    def job(number):
-        if number == 2:
-            raise ValueError("two")
-        time.sleep(1e-4)
-        done.append(number)
-
-    with pytest.raises(ValueError, match="two"):
-        threads.for_each(20_000, job)
-    assert len(done) < 19_999
-    threads.for_each(2, done.append)  # the threads survive
-
-
 def test_map_on_threads_keeps_the_order_on_single_threads():
     def job(number):
         return number, torch.get_num_threads(), threading.get_ident()
@@ -105,7 +90,19 @@ def test_a_pool_whose_threads_cannot_start_fails_at_once(monkeypatch):
     assert torch.get_num_threads() == 2
 
 
-def test_jobs_that_have_not_started_are_cancelled_after_an_error():
+def fail_after_submission(count, job):
+    with threads.single_threaded_pool() as pool:
+        for number in range(1, count):
+            pool.submit(job, number)
+        job(0)
+
+
+def mapped(count, job):
+    threads.map_on_threads(job, range(count))
+
+
+@pytest.mark.parametrize("run", [threads.for_each, mapped, fail_after_submission])
+def test_jobs_that_have_not_started_are_cancelled_after_an_error(run):
     done = []
 
     def job(number):
@@ -115,25 +112,7 @@ def test_jobs_that_have_not_started_are_cancelled_after_an_error():
         done.append(number)
 
     with pytest.raises(ValueError, match="zero"):
-        threads.map_on_threads(job, range(200))
-    assert len(done) < 100
-
-
-def test_submitted_jobs_are_cancelled_after_an_error_of_the_caller():
-    done = []
-
-    def job(number):
-        time.sleep(0.01)
-        done.append(number)
-
-    def submit_and_fail():
-        with threads.single_threaded_pool() as pool:
-            for number in range(200):
-                pool.submit(job, number)
-            raise ValueError("caller")
-
-    with pytest.raises(ValueError, match="caller"):
-        submit_and_fail()
+        run(200, job)
     assert len(done) < 100
 
 
