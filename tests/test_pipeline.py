@@ -74,36 +74,36 @@ def test_presets_have_the_stated_settings():
     assert [name for name, preset in PRESETS.items() if preset.search] == ["paper"]
 
 
+OTHER = {"any": "paper", "own": "principal", "perspective": "orthographic", "CS": "HFN"}
+OTHER |= {"geometric": "paper", "none": "bank", "monotone": "paper"}
+OTHER |= {EvidenceWeights(): EvidenceWeights(details=2.0)}
+
+
+def other(value):
+    """Another value of a setting; the same one, of a digest."""
+    if isinstance(value, int | float):
+        return value + 1 if isinstance(value, int) else 0.9 * value
+    return value[:1] if isinstance(value, tuple) else OTHER.get(value, value)
+
+
+def varied(settings):
+    """Changes of one setting each."""
+    changes = ({f.name: other(getattr(settings, f.name))} for f in fields(settings))
+    copies = [replace(settings, **change) for change in changes]
+    return [one for one in copies if one != settings]
+
+
 def test_json_contains_every_setting():
     base = Pipeline()
-    settings = [
-        {"field": "focus", "weights": ""},
-        {"terms": base.terms[:2]},
-        {"box_jitter": 0.2},
-        {"box_is": "visible"},
-        {"weights": "0123"},
-    ]
-    settings += [{"hypotheses": 6}, {"search": True, "contours": False}, {"contours": False}]
-    settings += [{"views": ViewPolicy(pose="paper")}, {"views": ViewPolicy(frame="principal")}]
-    changed = [base.with_pose_prior("upright"), *(replace(base, **setting) for setting in settings)]
-    for part, names in {
-        "views": ("directions", "theta_step", "azimuth_step", "distance"),
-        "bank": ("image_size", "sigma", "margin", "bins"),
-        "detection": ("views", "proposals"),
-    }.items():
-        changed += [replace(base, **{part: replace(getattr(base, part), **{n: 40})}) for n in names]
-    for f in fields(FitSettings):
-        other = {"wide_angles": (10.0,), "weights": EvidenceWeights(details=2.0)}
-        fractions = dict.fromkeys(("kept_keypoints", "lost_confidence", "reliable"), 0.75)
-        value = (other | fractions).get(f.name, 7)
-        changed.append(replace(base, fit=replace(base.fit, **{f.name: value})))
-    for term in base.terms:
-        for f in fields(term):
-            value = {"none": "bank", "monotone": "paper", 1000: 7, 64: 7}.get(
-                getattr(term, f.name), 0.3
-            )
-            if f.name != "weights":
-                changed.append(base.with_term(term.name, **{f.name: value}))
+    settings = [{"field": "focus", "weights": ""}, {"weights": "0123"}, {"terms": base.terms[:2]}]
+    settings += [{"box_jitter": 0.2}, {"box_is": "visible"}, {"hypotheses": 6}]
+    settings += [{"search": True, "contours": False}, {"contours": False}]
+    for part in ("views", "bank", "detection", "fit"):
+        settings += [{part: one} for one in varied(getattr(base, part))]
+    for place, term in enumerate(base.terms):
+        others = base.terms[:place], base.terms[place + 1 :]
+        settings += [{"terms": (*others[0], one, *others[1])} for one in varied(term)]
+    changed = [replace(base, **setting) for setting in settings]
     texts = {pipeline.to_json() for pipeline in changed}
     assert len(texts) == len(changed)
     assert base.to_json() not in texts

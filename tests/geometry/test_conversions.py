@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
 from tests._support import double, eye, refused
+from tests._support.poses import poses
 
 
 def test_opengl_cameras_look_backward_with_y_up():
-    R = torch.from_numpy(Rotation.random(7, random_state=0).as_matrix())
-    T = g.transform(R, double([0.2, -0.1, 5.0]).expand(7, 3))
+    T = poses(7, 0)
     flipped = torch.diag(double([1.0, -1.0, -1.0, 1.0])) @ T
     assert torch.equal(g.opengl_from_opencv(T), flipped)
     assert torch.equal(g.opencv_from_opengl(flipped), T)

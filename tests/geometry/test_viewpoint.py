@@ -18,6 +18,7 @@ from curvireg_torch.geometry import (
 from curvireg_torch.geometry.viewpoint import angles_between
 from curvireg_torch.utils.choices import UP_AXES
 from tests._support import double, eye, refused, seeded
+from tests._support.poses import rotations
 
 
 @pytest.mark.parametrize(
@@ -39,7 +40,7 @@ def test_rotations_have_the_type_of_the_tensors_and_of_numbers_alone_float64(ang
 
 
 def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint():
-    R = torch.from_numpy(Rotation.random(500, random_state=0).as_matrix())
+    R = rotations(500, 0)
     a, e, t = g.viewpoint_from_rotation(R)
     assert ((a >= 0) & (a < 360) & (e.abs() <= 90) & (t >= -180) & (t < 180)).all()
     assert_close(g.rotation_from_viewpoint(a, e, t), R, rtol=0, atol=1e-12)
@@ -69,8 +70,8 @@ def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(elevation
 
 
 def test_angles_of_all_pairs_are_those_of_the_nearest_symmetry():
-    R = torch.from_numpy(Rotation.random(5, random_state=1).as_matrix())
-    others = torch.from_numpy(Rotation.random(7, random_state=2).as_matrix())
+    R = rotations(5, 1)
+    others = rotations(7, 2)
     group = torch.from_numpy(Rotation.create_group("C4").as_matrix())
     plain = rotation_error(R[:, None], others[None])
     assert_close(angles_between(R, others), plain)
