@@ -12,9 +12,10 @@ from torch.testing import assert_close
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError, RenderingError
-from curvireg_torch.rendering import contours as contours_module
 from curvireg_torch.rendering import make_renderer
+from curvireg_torch.rendering.contours import MeshContours
 from tests._support import double, eye, refused
+from tests._support.spies import spied
 
 from .conftest import camera
 
@@ -116,20 +117,14 @@ def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails(
 
 
 def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(monkeypatch):
-    used = []
-    level = contours_module.MeshContours._level
-
-    def watched(contours, limit):
-        used.append(len(contours._edges[limit].faces))
-        return level(contours, limit)
-
-    monkeypatch.setattr(contours_module.MeshContours, "_level", watched)
     # 20 480 faces
-    contours = contours_module.MeshContours(trimesh.creation.icosphere(subdivisions=5))
+    contours = MeshContours(trimesh.creation.icosphere(subdivisions=5))
+    used = spied(monkeypatch, contours, "_level")
     T = eye(4)[None]
     T[0, 2, 3] = 4.0
     for size in (100, 128, 129, 256, 400):
         K = double([[[size, 0, (size - 1) / 2], [0, size, (size - 1) / 2], [0, 0, 1]]])
         points = contours.points(T, K, size)
         assert (points.model.norm(dim=-1)[points.valid] - 1.0).abs().max() < 0.005
-    assert used == [2500, 2500, 8000, 8000, 8000]
+    faces = [len(contours._edges[limit].faces) for (limit,) in used]
+    assert faces == [2500, 2500, 8000, 8000, 8000]

@@ -3,6 +3,7 @@
 import itertools
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -111,17 +112,9 @@ def test_silhouette_agrees_with_project_points(backend, orthographic):
     corners = project_points(
         torch.from_numpy(triangle.vertices.copy()), T, K, orthographic=orthographic
     )
-    u, v, _ = pixel_grid(size).unbind(-1)
-    distances = []  # px from each edge
-    for i in range(3):
-        a = corners[:, i]
-        b = corners[:, (i + 1) % 3]
-        d = (b - a)[:, None, None]
-        cross = (u - a[:, 0, None, None]) * d[..., 1] - (v - a[:, 1, None, None]) * d[..., 0]
-        distances.append(cross / d.norm(dim=-1))
-    edges = torch.stack(distances)
-    inside = edges.amin(0).maximum(-edges.amax(0))
-    outside = -edges.amin(0).maximum(-edges.amax(0))
-    assert mask[inside > 0.005].all()
-    assert not mask[outside > 0.005].any()
+    pixels = [(x, y) for y in range(size[0]) for x in range(size[1])]
+    for seen, outline in zip(mask, corners.float().numpy(), strict=True):
+        inside = torch.tensor([cv2.pointPolygonTest(outline, pixel, True) for pixel in pixels])
+        assert seen.flatten()[inside > 0.005].all()  # px
+        assert not seen.flatten()[inside < -0.005].any()
     assert mask.sum() > 1000

@@ -138,24 +138,27 @@ def test_jobs_share_few_threads_on_many_cores():
     assert len(set(names)) <= threads.MAX_THREADS
 
 
+def numbers(_=None):
+    """Of the threads of torch, and of those for jobs."""
+    return torch.get_num_threads(), threads.available_threads()
+
+
 def test_one_torch_thread_gives_the_threads_of_torch_to_jobs():
     both = threading.Barrier(2, timeout=20)  # times out unless two jobs run at the same time
 
-    def threads_in_job(_):
+    def numbers_together(_):
         both.wait()
-        return torch.get_num_threads(), threads.available_threads()
+        return numbers()
 
-    assert (torch.get_num_threads(), threads.available_threads()) == (2, 2)
+    assert numbers() == (2, 2)
     with threads.one_torch_thread(), threads.one_torch_thread():
-        assert (torch.get_num_threads(), threads.available_threads()) == (1, 2)
-        threads.for_each(2, lambda _: both.wait())
-        assert threads.map_on_threads(threads_in_job, [0, 1]) == [(1, 1)] * 2
-        assert threads.map_on_threads(
-            lambda _: (torch.get_num_threads(), threads.available_threads()), [0]
-        ) == [(1, 2)]
+        assert numbers() == (1, 2)
+        threads.for_each(2, numbers_together)
+        assert threads.map_on_threads(numbers_together, [0, 1]) == [(1, 1)] * 2
+        assert threads.map_on_threads(numbers, [0]) == [(1, 2)]
         with threads.single_threaded_pool() as pool:
-            assert list(pool.map(threads_in_job, [0, 1])) == [(1, 1)] * 2
-        assert (torch.get_num_threads(), threads.available_threads()) == (1, 2)
-    assert (torch.get_num_threads(), threads.available_threads()) == (2, 2)
+            assert list(pool.map(numbers_together, [0, 1])) == [(1, 1)] * 2
+        assert numbers() == (1, 2)
+    assert numbers() == (2, 2)
     torch.set_num_threads(1)
     assert threads.available_threads() == 1, "outside, the setting of the caller holds"
