@@ -38,31 +38,26 @@ class _SubjectError(Exception):
         parts = (numbers, self.subject, self.message, reasons)
         return ": ".join(part for part in parts if part)
 
-    def _copy(self) -> Self:
+    def _copy(self, **changes: Any) -> Self:
         # Dask changes how the standard library copies errors: copies share their attributes.
         other = type(self)(self.message)
-        vars(other).update(vars(self))
+        vars(other).update(vars(self), **changes)
         return other
 
     def with_subject(self, subject: object) -> Self:
         """A copy about another subject, whatever it was about before."""
-        other = self._copy()
-        other.subject = str(subject)
-        other.images = ()
-        return other
+        return self._copy(subject=str(subject), images=())
 
     def of_image(self, number: int) -> Self:
         """A copy about the same subject in a photograph, by its number from 0."""
-        other = self._copy()
-        other.images = (number,)
-        return other
+        return self._copy(images=(number,))
 
     def with_image_names(self, names: Sequence[str]) -> Self:
         """A copy that calls photographs by their names instead of numbers."""
         named = " and ".join(names[number] for number in self.images)
-        other = self.with_subject(": ".join(part for part in (named, self.subject) if part))
-        other.causes = tuple(cause.with_image_names(names) for cause in self.causes)
-        return other
+        subject = ": ".join(part for part in (named, self.subject) if part)
+        causes = tuple(cause.with_image_names(names) for cause in self.causes)
+        return self._copy(subject=subject, images=(), causes=causes)
 
 
 class CurviregError(_SubjectError):

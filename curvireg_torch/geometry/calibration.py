@@ -21,7 +21,6 @@ from ..utils.checks import (
     check_photograph,
     check_tensor,
 )
-from ..utils.files import finite_numbers
 from .cameras import boxes_around
 from .crops import check_boxes
 
@@ -82,14 +81,14 @@ class Camera:
                 f"focal_deviation: expected a fraction >= 0, got {self.focal_deviation}"
             )
         # OpenCV's own arrays are (1, N) or (N, 1)
-        given = as_numbers(self.distortion, "distortion", dtype=torch.float64).flatten().tolist()
-        numbers = finite_numbers(given, len(given))
-        if numbers is None or len(numbers) not in MODELS[self.model]:
+        given = as_numbers(self.distortion, "distortion", dtype=torch.float64).flatten()
+        numbers = tuple(given.tolist())
+        if len(numbers) not in MODELS[self.model] or not given.isfinite().all():
             expected = (
                 f"{' or '.join(map(str, MODELS[self.model]))} finite coefficients of the model "
                 f"{self.model!r}"
             )
-            raise InvalidInputError(f"distortion: expected {expected}, got {given!r:.80}")
+            raise InvalidInputError(f"distortion: expected {expected}, got {[*numbers]!r:.80}")
         if self.size is not None and len(self.size) != 2:
             raise InvalidInputError(f"size: expected height and width in px, got {self.size}")
         for side in self.size or ():

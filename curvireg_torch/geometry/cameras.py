@@ -17,7 +17,7 @@ from ..utils.checks import (
     check_pose,
     check_rotation,
 )
-from .conversions import matrix_of_rows
+from .conversions import cross_matrix, matrix_of_rows
 
 MAX_BOX_ITERATIONS = 20
 MIN_BOX_STEP = 1e-9  # change of the position in an iteration, relative to the position
@@ -181,11 +181,8 @@ def turn_with_ray(position: Tensor) -> Tensor:
     distance = torch.linalg.vector_norm(position)
     ray = position / distance
     x, y, z = ray.unbind()
-    zero = torch.zeros_like(x)
-    rows = [zero, -z, y], [z, zero, -x], [-y, x, zero]
-    across = matrix_of_rows(rows)  # ray x difference
-    roll = torch.stack([y, -x, zero]) / (1.0 + z)
-    turn: Tensor = (across + torch.outer(ray, roll)) / distance
+    roll = torch.stack([y, -x, torch.zeros_like(x)]) / (1.0 + z)
+    turn: Tensor = (cross_matrix(ray) + torch.outer(ray, roll)) / distance
     return turn
 
 

@@ -291,8 +291,7 @@ def paper_views() -> ViewSphere:
         grid = sample_views(azimuth_step=20.0, elevations=[elevation], distances=distances)
         azimuth = (grid.azimuth + shift) % 360.0
         grids.append(ViewSphere(azimuth, grid.elevation, grid.theta - shift, grid.distance))
-    names = ("azimuth", "elevation", "theta", "distance")
-    return ViewSphere(*(torch.cat([getattr(grid, name) for grid in grids]) for name in names))
+    return ViewSphere.cat(grids)
 
 
 def uniform_views(
