@@ -12,7 +12,6 @@ from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import paper_views, sample_views
-from curvireg_torch.matching.cache import bank_key
 from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.pipeline import (
     DEFAULT,
@@ -149,9 +148,12 @@ WRONG = """\
 
 def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_mistake(tmp_path):
     path = tmp_path / "mine.json"
-    text = json.dumps({"box_jitter": 0.0, "terms": {"hog": {"weight": 2.0}}})
+    fit = {"screened_views": 15, "weights": {"appearance": 5.0}}
+    text = json.dumps({"box_jitter": 0.0, "terms": {"hog": {"weight": 2.0}}, "fit": fit})
     path.write_text("\ufeff" + text, encoding="utf-8")  # as editors of Windows write it
-    assert Pipeline.read(path) == Pipeline(box_jitter=0.0, terms=(Correlation(weight=2.0),))
+    settings = FitSettings(screened_views=15, weights=EvidenceWeights(appearance=5.0))
+    terms = (Correlation(weight=2.0),)
+    assert Pipeline.read(path) == Pipeline(box_jitter=0.0, terms=terms, fit=settings)
     with refused("no such pipeline", MissingFileError):
         Pipeline.read(tmp_path / "none.json")
     rows = [row.split(" => ") for row in WRONG.splitlines()]
@@ -162,17 +164,6 @@ def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_
         with refused(message) as caught:
             Pipeline.read(path)
         assert "mine.json" in str(caught.value)
-
-
-def test_a_file_varies_a_fit_and_keeps_the_bank():
-    text = '{"fit": {"screened_views": 15, "weights": {"appearance": 5.0}}}'
-    pipeline = Pipeline.from_json(text)
-    weights = EvidenceWeights(appearance=5.0)
-    assert pipeline.fit == FitSettings(screened_views=15, weights=weights)
-    mesh = trimesh.creation.box((1, 2, 3))
-    views = sample_views(azimuth_step=60, elevations=[20])
-    keys = [bank_key(mesh, views, pipeline=p, renderer="auto") for p in (pipeline, Pipeline())]
-    assert keys[0] == keys[1]
 
 
 def test_photograph_field_refuses_other_weights():

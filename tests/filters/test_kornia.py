@@ -3,19 +3,12 @@
 import kornia
 import pytest
 import torch
-from kornia.filters import spatial_gradient
 from torch.testing import assert_close
 
 from curvireg_torch import filters
 from curvireg_torch.filters import operations as ops
 from tests._support import double, seeded
 from tests._support.spies import spied
-
-
-def kornia_gradient(p):
-    """``ops.central_gradient`` by kornia."""
-    found = spatial_gradient(p, "diff", 1)
-    return found[..., 1:-1, 1:-1].unbind(2)  # the border has replicated neighbours
 
 
 def smoothed(sigma, **options):
@@ -28,8 +21,6 @@ PRIMITIVES = {
     "tensor": smoothed(double(1.7)),
     "large tensor": smoothed(double(6.0)),
     "tensor of zero": smoothed(double(0.0)),
-    # kornia's here, the library's never
-    "first": lambda x: torch.cat(ops.central_gradient(x), dim=1),
 }
 
 
@@ -43,8 +34,6 @@ def test_both_give_the_same_with_the_same_derivatives(name, shape, dtype):
         image = x.clone().requires_grad_()
         with pytest.MonkeyPatch.context() as patch:  # whatever the library prefers
             patch.setattr(ops, "prefers_shifts", lambda *_, shifts=not by_kornia: shifts)
-            if by_kornia:
-                patch.setattr(ops, "central_gradient", kornia_gradient)
             y = PRIMITIVES[name](image)
         (slope,) = torch.autograd.grad(y.square().sum(), image)
         found.append((y.detach(), slope))

@@ -97,26 +97,20 @@ def test_check_compatible_refuses_another_view_policy(truck):
                 constructor(upright, pipeline=other)
 
 
-def test_a_file_keeps_what_is_known_of_the_mesh(small_bank, tmp_path):
+def test_a_file_keeps_the_views_and_what_is_known_of_the_mesh(small_bank, tmp_path):
     known = {"unit": "in", "up": "-y", "file_name": "truck.ply"}
     known["warnings"] = (MeshWarning("stray", "far away"),)
     mesh = replace(small_bank.mesh, **known)
-    bank = ViewBank(mesh, small_bank.views, small_bank.pipeline, small_bank.tensors)
-    bank.save(tmp_path / "bank.safetensors")
-    loaded = ViewBank.load(tmp_path / "bank.safetensors").mesh
-    assert {name: getattr(loaded, name) for name in known} == known
-    slow = {"extreme_points", "mesh_symmetries", "is_its_own_mirror_image", "round_axis"}
-    assert slow <= set(loaded.measures)
-
-
-def test_save_and_load(small_bank, tmp_path):
     path = tmp_path / "new" / "bank.safetensors"
-    small_bank.save(path)
-    loaded = ViewBank.load(path)
-    assert_same(loaded, small_bank, atol=5e-4)
-    np.testing.assert_array_equal(loaded.mesh.vertices, small_bank.mesh.vertices)
-    np.testing.assert_array_equal(loaded.mesh.faces, small_bank.mesh.faces)
-    assert (loaded.mesh.unit, [p.name for p in path.parent.iterdir()]) == ("m", [path.name])
+    ViewBank(mesh, small_bank.views, small_bank.pipeline, small_bank.tensors).save(path)
+    bank = ViewBank.load(path)
+    assert_same(bank, small_bank, atol=5e-4)
+    assert {name: getattr(bank.mesh, name) for name in known} == known
+    slow = {"extreme_points", "mesh_symmetries", "is_its_own_mirror_image", "round_axis"}
+    assert slow <= set(bank.mesh.measures)
+    for part in ("vertices", "faces"):
+        np.testing.assert_array_equal(getattr(bank.mesh, part), getattr(mesh, part))
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
     if os.name == "posix":
         mask = os.umask(0)
         os.umask(mask)
@@ -198,7 +192,6 @@ def with_nan(x):
         ("silhouettes", lambda x: x.bool(), "expected uint8"),
         ("extreme_points", with_nan, "extreme_points: expected finite"),
         ("extreme_points", lambda x: x[:0], "extreme_points: those of another mesh"),
-        ("extreme_points", lambda x: x[:1], "extreme_points: those of another mesh"),
         ("extreme_points", lambda x: 1.1 * x, "extreme_points: those of another mesh"),
         ("extreme_points", lambda x: 0.9 * x, "extreme_points: those of another mesh"),
         ("extreme_points", lambda x: x.float(), "extreme_points: expected float64"),

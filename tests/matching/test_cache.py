@@ -17,7 +17,7 @@ from curvireg_torch.matching import ViewBank, bank_key, cache, cache_folder, cac
 from curvireg_torch.matching.cache import clear_cache
 from curvireg_torch.mesh import symmetry
 from curvireg_torch.mesh.mesh import as_mesh
-from curvireg_torch.pipeline import PRESETS, BankSettings
+from curvireg_torch.pipeline import PRESETS, BankSettings, FitSettings
 
 PIPELINE = replace(PRESETS["classical"], bank=BankSettings(image_size=64))  # quickly built
 VIEWS = sample_views(azimuth_step=90, elevations=[20])
@@ -66,6 +66,8 @@ def test_bank_key_depends_on_everything(monkeypatch):
     keys += [key(mesh, VIEWS[:3]), key(mesh, renderer="embree")]
     keys += [key(mesh, pipeline=replace(PIPELINE, bank=replace(PIPELINE.bank, sigma=1.5)))]
     assert key(textured().copy()) in keys
+    fit = FitSettings(screened_views=15)
+    assert key(mesh, pipeline=replace(PIPELINE, fit=fit)) == keys[0]
     monkeypatch.setattr(cache, "package_digest", lambda **_: "another version")
     keys.append(key(mesh))
     assert len(set(keys)) == len(keys)

@@ -36,21 +36,18 @@ def textured_box():
         picture[:, 32 * i : 32 * (i + 1)] = colour
         picture[:, 32 * i : 32 * i + 16] //= 2
     picture[8:] //= 2
-    vertices = []
-    faces = []
-    uv = []
-    for i in range(6):
-        axis = i // 2
-        sign = 1 if i % 2 else -1
-        for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-            vertices.append(np.roll([sign, a, b], axis) * 0.5)
-            uv.append(((i + 0.5 + 0.5 * a) / 6, 0.5 + 0.4 * b))
-        faces += [[4 * i, 4 * i + 1, 4 * i + 2], [4 * i, 4 * i + 2, 4 * i + 3]]
+    box = trimesh.creation.box()
+    box.unmerge_vertices()
+    axis = np.abs(box.face_normals).argmax(axis=1).repeat(3)
+    index = np.arange(len(axis))
+    side = 2 * axis + (box.vertices[index, axis] > 0)
+    a, b = (box.vertices[index, (axis + k) % 3] for k in (1, 2))
     material = trimesh.visual.material.SimpleMaterial(
         image=Image.fromarray(picture), diffuse=[255] * 4
     )
-    visual = trimesh.visual.TextureVisuals(uv=np.array(uv), material=material)
-    return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+    uv = np.stack([(side + 0.5 + a) / 6, 0.5 + 0.8 * b], axis=1)
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(box.vertices, box.faces, visual=visual, process=False)
 
 
 def expected_albedo(points):
