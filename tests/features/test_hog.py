@@ -12,7 +12,7 @@ from curvireg_torch.features import field_points, hog
 from curvireg_torch.filters import ImageGradient, image_gradient
 from tests._support import refused, seeded
 
-from ..filters.layer_cases import photos
+from ..filters.layer_cases import grid, photos
 
 
 def _slow_hog(field, grid, bins, block, clip):
@@ -101,8 +101,7 @@ def test_hog_rejects_wrong_weights_and_grids():
 
 def _line(angle):
     """A ridge through the centre of a 41 px image, the field pointing across it."""
-    axis = torch.arange(41.0) - 20
-    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    x, y = grid(41, dtype=torch.float32)
     a = torch.tensor(angle).deg2rad()
     distance = x * torch.cos(a) + y * torch.sin(a)
     return torch.exp(-0.5 * (distance / 2) ** 2)[None] * torch.stack(

@@ -9,6 +9,7 @@ from torch.testing import assert_close
 
 from curvireg_torch import filters
 from curvireg_torch.filters.focus import MODES
+from curvireg_torch.geometry import camera_matrix
 from tests._support import double, seeded
 
 from .layer_cases import LAYERS, cylinder, grid, plane, sphere
@@ -75,7 +76,7 @@ def test_depth_layers_put_the_background_a_quarter_of_the_range_behind_the_objec
     near = float(depth[depth > 0].min())
     far = float(depth.max())
     filled = torch.where(depth > 0, depth, near + 1.25 * (far - near))
-    camera = {"camera_matrix": _camera(60.0, 33)}
+    camera = {"camera_matrix": camera_matrix(60.0, 60.0, 16.0, 16.0)}
     for layer, options, filled_options in (
         (filters.hessian_frobenius_norm, {}, {"depth_scale": 1.0 / (far - near)}),
         (filters.average_shading_gradient, camera, camera),
@@ -99,11 +100,6 @@ def test_average_shading_gradient_of_a_sphere():
     assert_close(field.norm(dim=1)[0][inside], want[inside], rtol=2e-3, atol=0.0)
 
 
-def _camera(focal, size):
-    c = (size - 1) / 2
-    return double([[focal, 0.0, c], [0.0, focal, c], [0.0, 0.0, 1.0]])
-
-
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
 def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_unit(unit):
     """fx != fy and cx != cy: the normal (point - centre) / radius is differentiated numerically."""
@@ -111,7 +107,7 @@ def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_
     W = 61
     d = 5.0
     r = 2.0
-    camera = double([[130.0, 0.0, 24.0], [0.0, 90.0, 31.0], [0.0, 0.0, 1.0]])
+    camera = camera_matrix(130.0, 90.0, 24.0, 31.0)
 
     def surface(u, v):
         """Depth and normals (3, ...) at pixels u, v, of a sphere around (0.2, -0.1, d)."""

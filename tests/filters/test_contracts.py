@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch._dynamo.testing import CompileCounter
 
-from curvireg_torch import filters
+from curvireg_torch import camera_matrix, filters
 
 from .._support.layer_contract import SIZE, LayerContract, tensors
 from .layer_cases import LAYERS, PAIRS, depths, equal_up_to_sign, photos
@@ -146,9 +146,7 @@ def test_fields_rotate_and_mirror_with_the_image(layer, seed):
     x = _input(layer, seed)
     options = dict(layer.options)
     if "camera_matrix" in options:  # one that is centred on the 25 px image, and so as symmetric
-        options["camera_matrix"] = torch.tensor(
-            [[40.0, 0.0, 12.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]]
-        )
+        options["camera_matrix"] = camera_matrix(40.0, 40.0, 12.0, 12.0)
     field = layer.function(x, **options)
     vx, vy = torch.rot90(field, 1, (-2, -1)).split(1, dim=1)
     assert _close(

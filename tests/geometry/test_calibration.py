@@ -113,19 +113,18 @@ def test_camera_of_a_resized_photograph():
 
 
 def test_sides_are_scaled_on_their_own_when_a_resized_picture_is_rounded():
-    camera = Camera([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], size=(480, 640))
+    camera = Camera(camera_matrix(500.0, 500.0, 319.5, 239.5), size=(480, 640))
     small = camera.at((7, 9))  # 6.75 x 9, or 7 x 9.33
     x = 9 / 640
     y = 7 / 480
-    expected = [[500 * x, 0, 320 * x - 0.5], [0, 500 * y, 240 * y - 0.5], [0, 0, 1]]
-    assert_close(small.matrix, double(expected))
+    assert_close(small.matrix, camera_matrix(500 * x, 500 * y, 320 * x - 0.5, 240 * y - 0.5))
 
 
 @pytest.mark.parametrize(
     ("calibrated", "size"), [((10, 1000), (50, 4996)), ((1000, 10), (4996, 50))]
 )
 def test_one_side_may_be_rounded_by_what_the_other_is_many_pixels_of(calibrated, size):
-    camera = Camera([[500.0, 0, 4.5], [0, 500, 4.5], [0, 0, 1]], size=calibrated)
+    camera = Camera(camera_matrix(500.0, 500.0, 4.5, 4.5), size=calibrated)
     # 50 x 5000 within a pixel of the short side, not of the long one
     assert camera.at(size).size == size
     with refused("another aspect ratio"):

@@ -13,7 +13,7 @@ from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
 from tests._support import double, eye, refused, seeded
 
-K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
+K = g.camera_matrix(800.0, 820.0, 310.0, 255.0)
 
 
 def test_project_points_agrees_with_opencv():
@@ -24,11 +24,11 @@ def test_project_points_agrees_with_opencv():
     T = g.transform(
         torch.from_numpy(Rotation.from_rotvec(rotation).as_matrix()), torch.from_numpy(t)
     )
-    ours = g.project_points(torch.from_numpy(X), T, K)
-    assert_allclose(ours, expected, atol=1e-9)
-    box = g.projected_boxes(torch.from_numpy(X), T, K)
+    points = torch.from_numpy(X)
+    assert_allclose(g.project_points(points, T, K), expected, atol=1e-9)
+    box = g.projected_boxes(points, T, K)
     assert_allclose(box, [*expected.min(0), *expected.max(0)], atol=1e-9)
-    mixed = g.project_points(torch.from_numpy(X).float(), T, K.float())
+    mixed = g.project_points(points.float(), T, K.float())
     assert mixed.dtype == torch.float64
     assert_allclose(mixed, expected, atol=1e-3)
     for wrong, message in ((X, "got ndarray"), (torch.ones(40, 2), r"shape \(\*, 3\)")):
@@ -63,7 +63,7 @@ def test_pose_from_box_keeps_the_object_in_front_of_the_camera():
     nearest = 1.05 * 3.0**0.5  # extents of the cube
     straight = g.pose_from_box(cube, eye(3), box, K)[1]
     assert float(straight[2]) == pytest.approx(nearest, rel=1e-6)
-    rotated = g.rotation_from_viewpoint(20.0, 30.0, 10.0).double()
+    rotated = g.rotation_from_viewpoint(20.0, 30.0, 10.0)
     assert float(g.pose_from_box(cube, rotated, box, K)[1][2]) > nearest - 1e-6
 
 

@@ -32,11 +32,9 @@ def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d():
         xy = p[:, :2] / p[:, 2:]
         xy = xy @ np.array([[math.cos(tr), math.sin(tr)], [-math.sin(tr), math.cos(tr)]])
         expected = np.stack([px + xy[:, 0], py - xy[:, 1]], 1)
-        R = g.rotation_from_viewpoint(*(double(v) for v in (a, e, t)))
+        R = g.rotation_from_viewpoint(a, e, t)
         T = g.transform(R, double([0.0, 0.0, d]))
-        ours = g.project_points(
-            torch.from_numpy(X), T, g.camera_matrix(f, f, px, py, dtype=torch.float64)
-        )
+        ours = g.project_points(torch.from_numpy(X), T, g.camera_matrix(f, f, px, py))
         assert_allclose(ours, expected, atol=1e-8)
         back = [float(v) for v in g.viewpoint_from_rotation(R)]
         assert_allclose(back, (a, e, t), atol=1e-9)

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 import trimesh
 
 from curvireg_torch.errors import RenderingError
-from curvireg_torch.geometry import transform, uniform_views
+from curvireg_torch.geometry import camera_matrix, transform, uniform_views
 from curvireg_torch.rendering import make_renderer
 
 BACKENDS = ("auto", "embree", "pyrender")
@@ -50,8 +50,7 @@ def camera(count, *, radius=1.0, centre=None, orthographic=False):
     t = -(R @ centre)
     t[:, 2] += 4.0 * radius
     f = 60.0 / radius if orthographic else 240.0
-    K = torch.tensor([[f, 0.0, 70.3], [0, 1.1 * f, 51.8], [0, 0, 1]], dtype=torch.float64)
-    return transform(R, t), K, (108, 154)
+    return transform(R, t), camera_matrix(f, 1.1 * f, 70.3, 51.8), (108, 154)
 
 
 def pixel_grid(size):

@@ -6,7 +6,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint, transform
 from curvireg_torch.mesh import as_mesh, load_mesh
 from curvireg_torch.rendering import make_renderer, render_colour, shade
 from tests._support import double, refused
@@ -20,12 +20,12 @@ COLOURS = [
     (220, 20, 230),
 ]
 SIZE = (72, 96)
-K = double([[150.0, 0, 47.5], [0, 150.0, 35.5], [0, 0, 1]])
+K = camera_matrix(150.0, 150.0, 47.5, 35.5)
 
 
 def camera(azimuth, elevation, theta=0.0, distance=5.0):
-    R = rotation_from_viewpoint(*(double([a]) for a in (azimuth, elevation, theta)))
-    return transform(R, double([[0.0, 0.0, distance]]))
+    R = rotation_from_viewpoint(azimuth, elevation, theta)
+    return transform(R, double([0.0, 0.0, distance]))[None]
 
 
 def textured_box():

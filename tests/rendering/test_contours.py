@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint, transform
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.rendering.contours import (
     MAX_OCCLUDING,
@@ -20,7 +20,7 @@ from curvireg_torch.rendering.contours import (
 from curvireg_torch.synthetic import example_mesh
 from tests._support import double, eye
 
-K = double([[220.0, 0, 63.5], [0, 220.0, 63.5], [0, 0, 1]])
+K = camera_matrix(220.0, 220.0, 63.5, 63.5)
 
 
 def stairs(unit):
@@ -39,8 +39,8 @@ def poses():
     """(4, 4, 4) around the mesh in units, 5 to 8 away."""
     T = []
     for azimuth, elevation, distance in ((20, 25, 5), (110, 40, 6), (200, 10, 7), (290, 60, 8)):
-        R = rotation_from_viewpoint(float(azimuth), float(elevation), 10.0).double()
-        T.append(transform(R, double([0.0, 0.0, float(distance)])))
+        R = rotation_from_viewpoint(azimuth, elevation, 10.0)
+        T.append(transform(R, double([0.0, 0.0, distance])))
     return torch.stack(T)
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch.geometry import transform
+from curvireg_torch.geometry import camera_matrix, transform
 from curvireg_torch.rendering.contours import MAX_OCCLUDING, MeshContours, _Places, _Views
 from tests._support import double, eye
 from tests._support.tables import text_table
@@ -19,7 +19,7 @@ RADIUS = np.hypot(0.5, 0.5)
 DISTANCE = 10.0
 PIXEL = 0.01
 """Length of a pixel at the plate's distance."""
-K = double([[DISTANCE / PIXEL, 0, 63.5], [0, DISTANCE / PIXEL, 63.5], [0, 0, 1]])
+K = camera_matrix(DISTANCE / PIXEL, DISTANCE / PIXEL, 63.5, 63.5)
 IN_FRONT = transform(eye(3), double([0.0, 0.0, DISTANCE]))[None]
 
 

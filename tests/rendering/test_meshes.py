@@ -54,7 +54,7 @@ def test_render_ignores_face_orientation_and_doubled_and_degenerate_faces(backen
 
 def test_render_with_the_camera_inside_and_the_object_behind(backend, orthographic):
     renderer = make_renderer(trimesh.creation.box((2.0, 2.0, 2.0)), backend)
-    wide = torch.tensor([[30.0, 0, 19.5], [0, 30.0, 14.5], [0, 0, 1]])
+    wide = cr.camera_matrix(30.0, 30.0, 19.5, 14.5)
     near = 2e-3 * 3**0.5
     T = torch.eye(4).repeat(3, 1, 1)
     T[:, 2, 3] = torch.tensor([0.25, -5.0, 1.0 + near])  # inside; behind; just in front
@@ -123,8 +123,8 @@ def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(monkeypatch):
     T = eye(4)[None]
     T[0, 2, 3] = 4.0
     for size in (100, 128, 129, 256, 400):
-        K = double([[[size, 0, (size - 1) / 2], [0, size, (size - 1) / 2], [0, 0, 1]]])
-        points = contours.points(T, K, size)
+        middle = (size - 1) / 2
+        points = contours.points(T, cr.camera_matrix(size, size, middle, middle)[None], size)
         assert (points.model.norm(dim=-1)[points.valid] - 1.0).abs().max() < 0.005
     faces = [len(contours._edges[limit].faces) for (limit,) in used]
     assert faces == [2500, 2500, 8000, 8000, 8000]

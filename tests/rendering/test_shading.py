@@ -4,12 +4,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.rendering.shading import AMBIENT, LIT, shade
 from tests._support import double
 
 from .conftest import pixel_grid
 
-K = double([[80.0, 0, 20.0], [0, 90.0, 40.0], [0, 0, 1]])
+K = camera_matrix(80.0, 90.0, 20.0, 40.0)
 RAYS = (pixel_grid((64, 64)) @ torch.linalg.inv(K).T).permute(2, 0, 1)
 
 
@@ -32,6 +33,6 @@ def test_shade_is_sharp_at_contours_and_steps():
     depth[..., 3:9, 2:8] = 4.0
     depth[..., 3:9, 8:14] = 9.0  # a step
     depth[..., 1, 20] = 3.0  # a single pixel
-    grey = shade(depth, torch.tensor([[1000.0, 0, 11.5], [0, 1000.0, 5.5], [0, 0, 1]]))
+    grey = shade(depth, camera_matrix(1000.0, 1000.0, 11.5, 5.5))
     assert (grey[depth > 0] > LIT - 1e-3).all()
     assert (grey[depth == 0] == 1.0).all()

@@ -11,8 +11,8 @@ from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.utils import checks
 from tests._support import double, eye, refused, seeded
 
-CAMERA = double([[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]])
-POSE = geometry.transform(cr.rotation_from_viewpoint(30.0, 20.0).double(), double([0.1, 0.2, 6.0]))
+CAMERA = cr.camera_matrix(220.1, 220.1, 63.5, 47.5)
+POSE = geometry.transform(cr.rotation_from_viewpoint(30.0, 20.0), double([0.1, 0.2, 6.0]))
 
 
 def changed(matrix, *changes):

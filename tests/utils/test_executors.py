@@ -165,21 +165,6 @@ def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
         pytest.fail("connected")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["processes", "dask"])
-def test_a_worker_that_is_killed_costs_a_repetition(kind, tmp_path):
-    if kind == "dask":
-        distributed = pytest.importorskip("distributed", reason="the extra cluster")
-        cluster = distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None, processes=True
-        )
-        with cluster, distributed.Client(cluster) as client:
-            check_killed_worker(Workers(executor=client.get_executor()), tmp_path)
-    else:
-        with Workers(2) as workers:
-            check_killed_worker(workers, tmp_path)
-
-
 def slowly(folder, tasks):
     """Twice each task, whose process is noted; the third one waits to be killed, once."""
     for task in tasks:
@@ -189,16 +174,24 @@ def slowly(folder, tasks):
     return [2 * task for task in tasks]
 
 
-def check_killed_worker(workers, folder):
+@pytest.mark.slow
+def test_a_worker_of_a_cluster_that_is_killed_costs_a_repetition(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the extra cluster")
+    cluster = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, processes=True
+    )
+
     def kill():
-        while not (busy := list(folder.glob("3-*"))):
+        while not (busy := list(tmp_path.glob("3-*"))):
             time.sleep(0.05)
-        (folder / "killed").touch()
+        (tmp_path / "killed").touch()
         os.kill(int(busy[0].name.partition("-")[2]), signal.SIGKILL)
 
-    threading.Thread(target=kill, daemon=True).start()
-    results = list(workers.map(slowly, folder, [[task] for task in range(8)]))
-    assert (folder / "killed").exists()
+    with cluster, distributed.Client(cluster) as client:
+        threading.Thread(target=kill, daemon=True).start()
+        workers = Workers(executor=client.get_executor())
+        results = list(workers.map(slowly, tmp_path, [[task] for task in range(8)]))
+    assert (tmp_path / "killed").exists()
     assert sorted(results) == [(task, 2 * task) for task in range(8)]
 
 
