@@ -2,7 +2,7 @@
 times."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, fields, replace
 from functools import cached_property
@@ -31,7 +31,7 @@ from ..mesh.round_axis import RoundAxis, round_axis
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
 from ..terms import Appearance
-from ..utils.aliases import Fields, PathName
+from ..utils.aliases import Fields, PathName, Progress
 from ..utils.arrays import Array
 from ..utils.checks import check_device, check_finite, check_symmetries, check_tensor
 from ..utils.files import tensor_checksum, write_tensors
@@ -181,7 +181,7 @@ class ViewBank:
         camera: str | None = None,
         renderer: str | DepthRenderer = "auto",
         pipeline: Pipeline | None = None,
-        progress: bool | Callable[[str, int, int], object] = True,
+        progress: bool | Progress = True,
         device: torch.device | str = "cpu",
     ) -> "ViewBank":
         """Render, filter and describe every view, in chunks on several threads.

@@ -5,7 +5,6 @@ import os
 import re
 import time
 import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +18,7 @@ from ..geometry.viewpoint import ViewSphere
 from ..mesh import as_mesh
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
+from ..utils.aliases import Progress
 from ..utils.files import cache_folder, tensor_digest, text_digest
 from ..utils.likes import MeshLike
 from ..utils.sources import package_digest
@@ -102,7 +102,7 @@ def cached_bank(
     renderer: str | DepthRenderer = "auto",
     folder: Path | None = None,
     device: torch.device | str = "cpu",
-    progress: bool | Callable[[str, int, int], object] = True,
+    progress: bool | Progress = True,
 ) -> ViewBank:
     """The bank from the cache, or a new one that is stored there, whereupon the cache is trimmed to
     its limit. Concurrent processes are safe. A damaged file is built again. A folder that cannot be

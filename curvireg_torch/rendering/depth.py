@@ -5,6 +5,7 @@ from torch import Tensor
 
 from ..errors import InvalidInputError, RenderingError
 from ..mesh import Mesh, as_mesh
+from ..utils.aliases import Size
 from ..utils.checks import check_option
 from ..utils.choices import RENDERER_NAMES
 from ..utils.likes import MeshLike
@@ -52,7 +53,7 @@ def render_depth(
     mesh: MeshLike,
     T_cam_from_model: Tensor,
     camera_matrix: Tensor,
-    size: tuple[int, int],
+    size: Size,
     *,
     renderer: str | DepthRenderer = "auto",
     orthographic: bool = False,

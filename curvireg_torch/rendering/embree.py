@@ -18,6 +18,8 @@ from ..geometry import camera_matrix, rotation_from_viewpoint
 from ..geometry.cameras import transform
 from ..mesh.edges import encloses_volumes
 from ..mesh.mesh import Mesh, box_corners, extreme_points
+from ..utils.aliases import Size
+from ..utils.arrays import Array
 from ..utils.threads import for_each
 from .renderer import NEAREST, MeshRenderer
 
@@ -38,7 +40,7 @@ class RayScene:
     """Triangles for ray casting: (V, 3) vertices and (F, 3) faces; rays have (N, 3) origins and
     directions."""
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+    def __init__(self, vertices: Array, faces: Array) -> None:
         self._scene = EmbreeScene()
         TriangleMesh(
             scene=self._scene,
@@ -48,16 +50,14 @@ class RayScene:
         # builds embree's tree, which is not thread-safe
         self.distance(np.zeros((1, 3)), np.ones((1, 3)))
 
-    def distance(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def distance(self, origins: Array, directions: Array) -> Array:
         """(N,) float32 distances to the first hit, in units of the directions, which may be (1, 3);
         inf without one."""
-        distance: np.ndarray = self._scene.run(
-            float32(origins), float32(directions), query="DISTANCE"
-        )
+        distance: Array = self._scene.run(float32(origins), float32(directions), query="DISTANCE")
         distance[distance >= _MISS] = np.inf
         return distance
 
-    def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+    def hits(self, origins: Array, directions: Array) -> tuple[Array, ...]:
         """The first triangle hit (N,), -1 for none; barycentric u, v (N,) of its corners 2 and 3;
         the distance."""
         found = self._scene.run(
@@ -69,7 +69,7 @@ class RayScene:
         return face, found["u"], found["v"], distance
 
 
-def float32(x: np.ndarray) -> np.ndarray:
+def float32(x: Array) -> Array:
     return np.ascontiguousarray(x, np.float32)
 
 
@@ -81,13 +81,13 @@ class EmbreeRenderer(MeshRenderer):
     name = "embree"
 
     @cached_property
-    def _scene(self) -> tuple[RayScene, np.ndarray]:
+    def _scene(self) -> tuple[RayScene, Array]:
         """The triangles, and points (P, 3) whose hull is the object's."""
         few = len(self._mesh.vertices) <= _MAX_HULL_VERTICES
         outline = extreme_points(self._mesh) if few else box_corners(self._mesh)
         return RayScene(self._scaled(self._mesh.vertices), self._mesh.faces), self._scaled(outline)
 
-    def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
+    def _depth(self, T: Tensor, K: Tensor, size: Size, orthographic: bool) -> Tensor:
         scene, _ = self._scene
         return self._cast(T, K, size, orthographic, lambda _, *rays: scene.distance(*rays))
 
@@ -95,9 +95,9 @@ class EmbreeRenderer(MeshRenderer):
         self,
         T: Tensor,
         K: Tensor,
-        size: tuple[int, int],
+        size: Size,
         orthographic: bool,
-        hit: Callable[..., np.ndarray],
+        hit: Callable[..., Array],
     ) -> Tensor:
         """(N, 1, H, W) depth; ``hit`` is called with the place of the pixels of a view that may
         show the object, and their rays, and returns the distances to what these hit."""
@@ -118,10 +118,10 @@ class EmbreeRenderer(MeshRenderer):
         self,
         T_cam_from_model: Tensor,
         camera_matrix: Tensor,
-        size: tuple[int, int],
+        size: Size,
         *,
         orthographic: bool = False,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
+    ) -> tuple[Array, Array, Array, Tensor]:
         """(N, H, W) int32 faces that pixels show, -1 for none; (N, H, W) float32 u and v of their
         points (1 - u - v) a + u b + v c, with the face's corners a, b, c; and (N, 1, H, W)
         depth."""
@@ -130,15 +130,15 @@ class EmbreeRenderer(MeshRenderer):
         u, v = (np.zeros(face.shape, np.float32) for _ in range(2))
         scene, _ = self._scene
 
-        def hit(place: Any, *rays: np.ndarray) -> np.ndarray:
+        def hit(place: Any, *rays: Array) -> Array:
             face[place], u[place], v[place], along = scene.hits(*rays)
             return along
 
         return face, u, v, self._radius * self._cast(T, K, size, orthographic, hit)
 
     def _rays(
-        self, T: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
+        self, T: Array, K: Array, size: Size, orthographic: bool
+    ) -> tuple[Array, Array, Array, float] | None:
         """Pixels (H, W) that may show the object, origins and directions of their rays, and their
         start depth."""
         R = T[:3, :3]
@@ -163,9 +163,7 @@ class EmbreeRenderer(MeshRenderer):
             near,
         )
 
-    def _mask(
-        self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
-    ) -> np.ndarray:
+    def _mask(self, outline: Array, K: Array, size: Size, orthographic: bool) -> Array:
         """(H, W) bool: pixels inside the outline's projection, dilated by one pixel."""
         full = np.ones(size, dtype=bool)
         if orthographic:
@@ -182,16 +180,14 @@ class EmbreeRenderer(MeshRenderer):
         return np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8))).view(bool)
 
 
-def _combined(
-    pixels: tuple[np.ndarray, ...], x: np.ndarray, y: np.ndarray, z: float, axes: np.ndarray
-) -> np.ndarray:
+def _combined(pixels: tuple[Array, ...], x: Array, y: Array, z: float, axes: Array) -> Array:
     """(N, 3) float32 x(column) axes[0] + y(row) axes[1] + z axes[2] for the N rows and columns of
     pixels."""
     across = x.astype(np.float32)[:, None] * axes[0].astype(np.float32)
     down = y.astype(np.float32)[:, None] * axes[1].astype(np.float32) + (z * axes[2]).astype(
         np.float32
     )
-    rays: np.ndarray = across.take(pixels[1], axis=0)  # four times as fast as across[pixels[1]]
+    rays: Array = across.take(pixels[1], axis=0)  # four times as fast as across[pixels[1]]
     rays += down.take(pixels[0], axis=0)
     return rays
 
@@ -227,7 +223,7 @@ class RasterRenderer(EmbreeRenderer):
         K = camera_matrix(220.0, 220.0, 63.5, 63.5, dtype=torch.float64)
         return self._depth(transform(R, place.expand(8, 3)), K.expand(8, 3, 3), (128, 128), False)
 
-    def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
+    def _depth(self, T: Tensor, K: Tensor, size: Size, orthographic: bool) -> Tensor:
         if orthographic or len(self._faces) > size[0] * size[1]:
             return super()._depth(T, K, size, orthographic)
         poses = T.numpy()
@@ -248,9 +244,7 @@ class RasterRenderer(EmbreeRenderer):
             depth[rest.numpy()] = super()._depth(T[rest], K[rest], size, orthographic).numpy()
         return torch.from_numpy(depth)
 
-    def _draw(
-        self, T: np.ndarray, K: np.ndarray, size: tuple[int, int], near: float, far: float
-    ) -> np.ndarray:
+    def _draw(self, T: Array, K: Array, size: Size, near: float, far: float) -> Array:
         """(H, W) depth of one view."""
         H, W = size
         # OpenCV's camera: axes of OpenGL, 90 degrees from the top to the bottom of the image,

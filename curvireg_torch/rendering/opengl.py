@@ -15,6 +15,7 @@ from torch import Tensor
 from ..errors import InvalidInputError, RenderingError
 from ..geometry.conversions import opencv_from_opengl
 from ..mesh.mesh import Mesh, box_corners
+from ..utils.aliases import Size
 from .renderer import NEAREST, MeshRenderer
 
 _lock = threading.Lock()
@@ -88,7 +89,7 @@ class PyrenderRenderer(MeshRenderer):
             self._node = self._scene.add(pyrender.Mesh([primitive]))
             self._flags = pyrender.RenderFlags.DEPTH_ONLY | pyrender.RenderFlags.SEG
 
-    def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
+    def _depth(self, T: Tensor, K: Tensor, size: Size, orthographic: bool) -> Tensor:
         if orthographic:
             raise InvalidInputError("renderer: 'pyrender' knows no parallel projection; use 'auto'")
         out = np.zeros((len(T), 1, *size), dtype=np.float32)

@@ -10,6 +10,7 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..geometry.cameras import point_in_cameras, transform
 from ..mesh.mesh import Mesh, mesh_centre, mesh_radius
+from ..utils.aliases import Size
 from ..utils.checks import check_camera_matrix, check_integer, check_pose, check_tensor
 
 # Near plane, in object radii: surface closer to the camera plane, or behind it, is not rendered
@@ -31,7 +32,7 @@ class DepthRenderer(Protocol):
         self,
         T_cam_from_model: Tensor,
         camera_matrix: Tensor,
-        size: tuple[int, int],
+        size: Size,
         *,
         orthographic: bool = False,
     ) -> Tensor:
@@ -58,7 +59,7 @@ class MeshRenderer:
         self,
         T_cam_from_model: Tensor,
         camera_matrix: Tensor,
-        size: tuple[int, int],
+        size: Size,
         *,
         orthographic: bool = False,
     ) -> Tensor:
@@ -67,7 +68,7 @@ class MeshRenderer:
         return self._radius * self._depth(T, K, size, orthographic)
 
     def _in_radii(
-        self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool
+        self, T: Tensor, K: Tensor, size: Size, orthographic: bool
     ) -> tuple[Tensor, Tensor]:
         """Poses and cameras of the scaled mesh, checked, as float64 on the CPU."""
         T, K = check_render_arguments(T, K, size)
@@ -77,12 +78,12 @@ class MeshRenderer:
         place = point_in_cameras(T, self._centre) / self._radius
         return transform(T[:, :3, :3], place), K
 
-    def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
+    def _depth(self, T: Tensor, K: Tensor, size: Size, orthographic: bool) -> Tensor:
         """(N, 1, H, W) depth of the scaled mesh."""
         raise NotImplementedError
 
 
-def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def check_render_arguments(T: Tensor, K: Tensor, size: Size) -> tuple[Tensor, Tensor]:
     """Rigid poses (N, 4, 4), or one (4, 4), and cameras (N, 3, 3), checked, as float64 on the
     CPU."""
     T = T[None] if getattr(T, "ndim", 0) == 2 else T

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from ..mesh.colours import colours_at
 from ..mesh.mesh import as_mesh
+from ..utils.aliases import Size
 from ..utils.checks import check_camera_matrix, check_image, check_integer, check_tensor
 from ..utils.likes import MeshLike
 from .depth import make_renderer
@@ -21,7 +22,7 @@ def render_colour(
     mesh: MeshLike,
     T_cam_from_model: Tensor,
     camera_matrix: Tensor,
-    size: tuple[int, int],
+    size: Size,
     *,
     renderer: str | DepthRenderer = "auto",
     orthographic: bool = False,

@@ -5,6 +5,7 @@ import trimesh
 from torch import Tensor
 
 from ..mesh.mesh import Mesh
+from ..utils.aliases import Size
 from .embree import EmbreeRenderer
 from .renderer import NEAREST
 
@@ -33,7 +34,7 @@ class DeviceRenderer(EmbreeRenderer):
         self._vertices = torch.from_numpy(self._scaled(mesh.vertices)).to(self._device)
         self._faces = torch.tensor(mesh.faces, dtype=torch.long).to(self._device)
 
-    def _depth(self, T: Tensor, K: Tensor, size: tuple[int, int], orthographic: bool) -> Tensor:
+    def _depth(self, T: Tensor, K: Tensor, size: Size, orthographic: bool) -> Tensor:
         if orthographic:
             return super()._depth(T, K, size, orthographic).to(self._device)
         poses = T.to(self._device)
@@ -53,7 +54,7 @@ def _projected(points: Tensor, K: Tensor) -> Tensor:
     return xy * K.diagonal(dim1=1, dim2=2)[:, None, :2] + K[:, None, :2, 2]
 
 
-def _drawn(pixels: Tensor, z: Tensor, faces: Tensor, size: tuple[int, int]) -> Tensor:
+def _drawn(pixels: Tensor, z: Tensor, faces: Tensor, size: Size) -> Tensor:
     """(N, 1, H, W) float32 depth of N views with vertices at (N, V, 2) px and depths (N, V)."""
     H, W = size
     corners = pixels[:, faces]  # (N, F, 3, 2)
@@ -89,7 +90,7 @@ def _planes(corners: Tensor, z: Tensor) -> Tensor:
     return torch.cat([a, second, third, height[..., :1], slopes], dim=-1).float()
 
 
-def _inverse_depth(low: Tensor, sides: Tensor, planes: Tensor, size: tuple[int, int]) -> Tensor:
+def _inverse_depth(low: Tensor, sides: Tensor, planes: Tensor, size: Size) -> Tensor:
     """(N, 1, H, W) inverse depth, 0 for none, of triangles in N views: the first pixels of their
     boxes (N, F, 2), the boxes' sides (N, F, 2) and :func:`_planes` (N, F, 9)."""
     H, W = size
