@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
@@ -11,7 +12,8 @@ from curvireg_torch.geometry.cameras import point_in_cameras, pose_around
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
-from tests._support import double, eye, refused, seeded
+from tests._support import double, eye, refused, uniform
+from tests._support.poses import rotations
 
 K = g.camera_matrix(800.0, 820.0, 310.0, 255.0)
 
@@ -44,17 +46,16 @@ def test_pose_from_box_recovers_the_true_pose(spread):
     centre = mesh_centre(mesh)
     radius = mesh_radius(mesh)
     hull = extreme_points(mesh)
-    generator = seeded(0)
-    for i in range(25):
-        u = torch.rand(3, generator=generator, dtype=torch.float64)
-        ray = torch.stack([spread * (2 * u[0] - 1), spread * (2 * u[1] - 1), torch.ones_like(u[0])])
-        ray = ray / ray.norm() * (3.0 + 9.0 * u[2]) * radius
-        view = torch.from_numpy(Rotation.random(random_state=i).as_matrix())
-        R = g.rotation_towards(ray) @ view
-        box = g.projected_boxes(hull, g.transform(R, ray - R @ centre), K)
-        found_R, found_t = g.pose_from_box(hull, view, box, K)
-        assert g.rotation_error(found_R, R) < 0.01
-        assert ((found_R @ centre + found_t - ray).norm() / ray.norm()) < 1e-4
+    u = uniform(25, 3)
+    rays = F.pad(spread * (2.0 * u[:, :2] - 1.0), (0, 1), value=1.0)
+    rays = F.normalize(rays, dim=1) * (3.0 + 9.0 * u[:, 2:]) * radius
+    views = rotations(25, 0)
+    R = g.rotation_towards(rays) @ views
+    boxes = g.projected_boxes(hull, pose_around(R, rays, centre), K)
+    found_R, found_t = g.pose_from_box(hull, views, boxes, K)
+    assert g.rotation_error(found_R, R).max() < 0.01
+    off = found_R @ centre + found_t - rays
+    assert (off.norm(dim=1) / rays.norm(dim=1)).max() < 1e-4
 
 
 def test_pose_from_box_keeps_the_object_in_front_of_the_camera():

@@ -20,22 +20,18 @@ def test_opengl_cameras_look_backward_with_y_up():
 
 def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d():
     # p = diag(f, f, -1) Rx(e - 90) Rz(-a) (X - C), rotated by theta; v = py - y.
-    X, f, (px, py) = np.random.default_rng(0).uniform(-1, 1, (50, 3)), 3000.0, (70.3, 51.8)
+    X = np.random.default_rng(0).uniform(-1, 1, (50, 3))
     for a, e, t, d in ((30.0, 20.0, -10.0, 5.0), (200.0, -35.0, 100.0, 4.0), (0.0, 0.0, 0.0, 9.0)):
-        ar, er, tr = (math.radians(v) for v in (a, e, t))
-        C = d * np.array([math.cos(er) * math.sin(ar), -math.cos(er) * math.cos(ar), math.sin(er)])
-        R_camera = (
-            Rotation.from_euler("x", er - math.pi / 2).as_matrix()
-            @ Rotation.from_euler("z", -ar).as_matrix()
-        )
-        p = (X - C) @ R_camera.T @ np.diag([f, f, -1.0])
-        xy = p[:, :2] / p[:, 2:]
-        xy = xy @ np.array([[math.cos(tr), math.sin(tr)], [-math.sin(tr), math.cos(tr)]])
-        expected = np.stack([px + xy[:, 0], py - xy[:, 1]], 1)
+        (ca, ce, ct), (sa, se, st) = (f(np.radians([a, e, t])) for f in (np.cos, np.sin))
+        C = d * np.array([ce * sa, -ce * ca, se])
+        camera = Rotation.from_euler("zx", [-a, e - 90.0], degrees=True)
+        p = camera.apply(X - C) * [3000.0, 3000.0, -1.0]
+        xy = p[:, :2] / p[:, 2:] @ [[ct, st], [-st, ct]]
         R = g.rotation_from_viewpoint(a, e, t)
         T = g.transform(R, double([0.0, 0.0, d]))
-        ours = g.project_points(torch.from_numpy(X), T, g.camera_matrix(f, f, px, py))
-        assert_allclose(ours, expected, atol=1e-8)
+        K = g.camera_matrix(3000.0, 3000.0, 70.3, 51.8)
+        ours = g.project_points(torch.from_numpy(X), T, K)
+        assert_allclose(ours, [70.3, 51.8] + xy * [1.0, -1.0], atol=1e-8)
         back = [float(v) for v in g.viewpoint_from_rotation(R)]
         assert_allclose(back, (a, e, t), atol=1e-9)
 
@@ -75,10 +71,8 @@ def test_symmetry_transforms_reads_matrices_and_axes_and_refuses_malformed_input
     transforms = g.symmetry_transforms(CONTINUOUS, max_step_fraction=0.1).numpy()
     assert len(transforms) == 32  # ceil(pi / 0.1)
     unit = np.array(AXIS) / 3.0
-    for i, T in enumerate(transforms):
-        assert_allclose(
-            T[:3, :3], Rotation.from_rotvec(unit * i * 2 * np.pi / 32).as_matrix(), atol=1e-12
-        )
-        for along in (-5.0, 0.0, 2.0):
-            point = np.array(OFFSET) + along * unit
-            assert_allclose(T[:3, :3] @ point + T[:3, 3], point, atol=1e-12)
+    turns = Rotation.from_rotvec(np.outer(np.arange(32) * 2 * np.pi / 32, unit)).as_matrix()
+    assert_allclose(transforms[:, :3, :3], turns, atol=1e-12)
+    on_axis = np.transpose(OFFSET + np.outer([-5.0, 0.0, 2.0], unit))
+    moved = turns @ on_axis + transforms[:, :3, 3:]
+    assert_allclose(moved, np.broadcast_to(on_axis, moved.shape), atol=1e-12)
