@@ -183,8 +183,7 @@ class DetectionSettings:
     proposals: int = 20
 
     def __post_init__(self) -> None:
-        if min(self.views, self.proposals) < 1:
-            raise InvalidInputError(f"detection: expected views and proposals >= 1, got {self}")
+        _convert_integers(self, ("views", "proposals"), prefix="detection: ")
         if not 0.02 <= self.min_size <= 1.0:
             raise InvalidInputError(
                 f"detection: min_size: expected a fraction in [0.02, 1], got {self.min_size}"
@@ -329,8 +328,7 @@ class Pipeline:
                 f"by, got {names}"
             )
             raise InvalidInputError(f"terms: {message}")
-        if self.hypotheses < 1:
-            raise InvalidInputError(f"hypotheses: expected >= 1, got {self.hypotheses}")
+        _convert_integers(self, ("hypotheses",))
         if self.search and self.contours:
             raise InvalidInputError(
                 "search: the paper's search takes the place of the contour fit; set contours=False"

@@ -115,7 +115,7 @@ def test_json_contains_every_setting():
 def test_integers_of_numpy_become_those_of_json():
     bank = BankSettings(image_size=np.int64(64), bins=np.int32(9))
     fit = FitSettings(kept_starts=np.int64(4), close_rivals=np.int64(0))
-    pipeline = Pipeline(bank=bank, fit=fit)
+    pipeline = Pipeline(bank=bank, fit=fit, hypotheses=np.int64(3))
     assert Pipeline.from_json(pipeline.to_json()) == pipeline
     with refused("image_size: expected an integer"):
         BankSettings(image_size=64.0)

@@ -287,7 +287,7 @@ def test_detector_rejects_bad_distances_images_and_settings():
         detector()(image[:2])
     with refused("min_size"):
         cr.pipeline.DetectionSettings(min_size=0.0)
-    with refused("views and proposals"):
+    with refused("views: expected an integer"):
         cr.pipeline.DetectionSettings(views=0)
 
 
