@@ -4,7 +4,7 @@ contract."""
 import torch
 
 from curvireg_torch import features, filters
-from tests._support import seeded
+from tests._support import uniform
 
 from .._support.layer_contract import LayerCase
 
@@ -38,19 +38,14 @@ def plane(size, slope_x, slope_y, distance):
 
 def depths(n=2, size=24, *, seed=0, dtype=torch.float32):
     """Rough surfaces inside a disc, background 0."""
-    generator = seeded(seed)
-    z = 2.0 + torch.rand(n, 1, size, size, generator=generator, dtype=torch.float64)
-    z = filters.gaussian_smooth(z, 2.0)
+    z = filters.gaussian_smooth(2.0 + uniform(n, 1, size, size, seed=seed), 2.0)
     x, y = grid(size) if size % 2 else (g[1:, 1:] for g in grid(size + 1))
     return torch.where(x**2 + y**2 < (0.4 * size) ** 2, z, 0.0).to(dtype)
 
 
 def photos(n=2, size=24, *, seed=0, dtype=torch.float32):
     """Smooth noise with a bright box, in [0, 1]."""
-    generator = seeded(seed)
-    x = filters.gaussian_smooth(
-        torch.rand(n, 1, size, size, generator=generator, dtype=torch.float64), 1.0
-    )
+    x = filters.gaussian_smooth(uniform(n, 1, size, size, seed=seed), 1.0)
     x[..., size // 4 : 3 * size // 4, size // 3 : 2 * size // 3] += 0.4
     return (x / x.amax(dim=(1, 2, 3), keepdim=True)).to(dtype)
 

@@ -78,7 +78,6 @@ def test_kornia_is_not_called_where_gradients_are_wanted(calls):
 def test_grey_levels_are_those_of_kornia_in_graphs_too():
     x = torch.rand(2, 3, 8, 9)
     assert torch.equal(ops.to_grey(x), kornia.color.rgb_to_grayscale(x))
-    assert ops.to_grey(x[:, :1]) is not None
     torch._dynamo.reset()
     graph = torch.compile(ops.to_grey, fullgraph=True, backend="eager")
     assert_close(graph(x), ops.to_grey(x))

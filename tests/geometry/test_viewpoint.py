@@ -17,7 +17,7 @@ from curvireg_torch.geometry import (
 )
 from curvireg_torch.geometry.viewpoint import angles_between
 from curvireg_torch.utils.choices import UP_AXES
-from tests._support import double, eye, refused, seeded
+from tests._support import double, eye, refused, seeded, uniform
 from tests._support.poses import rotations
 
 
@@ -55,9 +55,7 @@ def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint():
 def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(elevation, noise):
     """Rotations from an optimiser are rounded, and so not exact."""
     generator = seeded(0)
-    azimuth, theta = (
-        360.0 * torch.rand(50, 20, generator=generator, dtype=torch.float64) for _ in range(2)
-    )
+    azimuth, theta = 360.0 * uniform(2, 50, 20)
     exact = g.rotation_from_viewpoint(azimuth, elevation, theta)
     perturbation = torch.randn(exact.shape[:-1], generator=generator, dtype=torch.float64) * noise
     tilt = torch.from_numpy(
