@@ -22,7 +22,7 @@ from tqdm import tqdm
 from ..data import Photo, Video, read_photo
 from ..data.images import ANIMATED, frame_tensor
 from ..errors import CurviregError, ImageError, InvalidInputError
-from ..formats.boxes import pixel_box
+from ..formats.boxes import PictureSize, pixel_box
 from ..formats.poses import PoseRecord
 from ..geometry import Camera, undistorted
 from ..geometry.crops import check_boxes
@@ -194,7 +194,7 @@ def _poses(
         image = photo.image
         result: Registration | FailedRegistration
         try:
-            box: Any = _box(options, name, image, is_first=is_first)
+            box: Any = _box(options, name, photo, is_first=is_first)
             is_first = False
             if isinstance(options.camera, Camera):
                 seen = undistorted(
@@ -230,11 +230,11 @@ def _started(
 
 
 def _box(
-    options: RegisterOptions, name: str, image: Tensor, *, is_first: bool
+    options: RegisterOptions, name: str, photo: Photo, *, is_first: bool
 ) -> list[float] | None:
     """The given box of the first frame, or a detector's of any; a frame that has none is searched
     for the object."""
-    size = (image.shape[-2], image.shape[-1])
+    size = (photo.image.shape[-2], photo.image.shape[-1])
     if options.box is not None:
         if not is_first:
             return None
@@ -243,7 +243,8 @@ def _box(
         return box
     video, _, number = name.rpartition("-")
     names = [name, f"{video}_{int(number) + 1}"] if number.isdecimal() else [name]
-    found = (options.detected_box(text, size) for text in names)
+    picture = PictureSize(size, photo.orientation)
+    found = (options.detected_box(text, picture) for text in names)
     return next(map(list, filter(None, found)), None)
 
 

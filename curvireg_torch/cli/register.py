@@ -158,10 +158,11 @@ CONFLICTS = {
     "every !videos": "--every applies to the frames of videos; leave it out",
     "start box|mask|listed|meshes": "--start refines one mesh in one photograph; leave --box, "
     "--mask and --list out",
+    "views mask": "--views: a rig takes no masks; leave --mask out",
     "listed box|mask|matrix": "the list holds boxes, masks and cameras; leave --box, --mask and "
     "--camera out",
-    "views guess|prior": "the rig holds the cameras, and a rig takes no pose prior; leave --fov, "
-    "--azimuth, ... out",
+    "views guess|prior|camera": "the rig holds the cameras, and a rig takes no pose prior; leave "
+    "--camera, --fov, --azimuth, ... out",
     "start_convention !start": "--start-convention: of the pose of --start; give it too",
     "start prior": "--start: refines this pose alone; leave the pose prior out",
     "distance !listed !camera !guess similar": f"--distance: {NO_CAMERA}",

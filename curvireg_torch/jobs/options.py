@@ -32,7 +32,7 @@ from ..utils.choices import (
 
 if TYPE_CHECKING:
     from ..features import LearnedCurvilinearSaliency
-    from ..formats.boxes import BoxFile
+    from ..formats.boxes import BoxFile, PictureSize
     from ..formats.boxes.files import Corners
     from ..formats.poses import PoseRecord
     from ..geometry import Camera
@@ -329,10 +329,10 @@ class RegisterOptions:
         is_relative = kind in ("fractions", "yolo") and photo.suffix.lower() not in VIDEOS
         return pixel_box(numbers, kind, picture_size(photo).shown if is_relative else None)
 
-    def detected_box(self, name: str, size: tuple[int, int]) -> "Corners | None":
-        """The box of a detector for a frame of (H, W) by its name; None where it has none, or there
-        is no detector."""
-        return None if self._box_file is None else self._box_file.of_frame(name, size)
+    def detected_box(self, name: str, picture: "PictureSize") -> "Corners | None":
+        """The box of a detector for a frame by its name; None where it has none, or there is no
+        detector."""
+        return None if self._box_file is None else self._box_file.of_frame(name, picture)
 
     def read_start(self) -> "PoseRecord | None":
         """The pose of the file ``start``, or None."""

@@ -26,6 +26,7 @@ from ..utils.files import FindFile, check_table_size, finite_numbers, found_in, 
 from .documents import result_document
 from .entry import Entry
 from .lists import BOX, CAMERA, ROTATION, TRANSLATION, given_camera, numbers_of
+from .options import PRIOR_OPTIONS
 from .photograph import register_views
 from .result_files import RegisteredViews
 
@@ -114,6 +115,10 @@ def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[Entry]:
     if twice := sorted({name for name in names if name and names.count(name) > 1}):
         raise InvalidInputError(
             f"two columns {', '.join(twice)}; keep one of each", subject="header"
+        )
+    if unused := sorted({"mask", "mesh", *PRIOR_OPTIONS}.intersection(names)):
+        raise InvalidInputError(
+            f"a rig takes no {', '.join(unused)}; leave these columns out", subject="header"
         )
     calibrations = Calibrations()
     for number, values in enumerate(rows, start=1):

@@ -10,13 +10,15 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from curvireg_torch import data
 from curvireg_torch.cli import following, main
 from curvireg_torch.cli.following import Tally
-from curvireg_torch.data import Video
+from curvireg_torch.data import Photo, Video
 from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Follower
 from curvireg_torch.visualization import OverlayVideo
@@ -176,6 +178,15 @@ def test_follow_takes_the_boxes_of_a_detector_by_frame(frames, follow, boxes, tm
     words = ["--box", *numbers, "--box-format", "yolo"]
     assert follow(*words, source="turn.avi", box=False, out="more") == 0
     assert boxes()[3:] == [expected, None, None]
+
+
+def test_boxes_of_stored_pixels_are_turned_with_their_frame(tmp_path):
+    image = {"id": 1, "file_name": "0.jpg", "height": 48, "width": 64}
+    box = {"image_id": 1, "bbox": [0, 0, 10, 20]}
+    (tmp_path / "boxes.json").write_text(json.dumps({"images": [image], "annotations": [box]}))
+    options = RegisterOptions([Path("0.jpg")], [], boxes=str(tmp_path / "boxes.json"))
+    turned = Photo(torch.zeros(3, 64, 48, dtype=torch.uint8), orientation=6)
+    assert following._box(options, "0.jpg", turned, is_first=True) == [27.5, -0.5, 47.5, 9.5]
 
 
 @pytest.mark.parametrize("source", slow_after(1, ["rtsp://camera/stream", "0"]))

@@ -202,6 +202,8 @@ def test_options_of_videos_and_processes_are_taken():
         ("--list l.csv m.ply --format m3t", "--format m3t: of one result"),
         ("a.png m.ply --start p.json --no-refine", "leave --no-refine out"),
         ("--views r.csv m.ply --boxes b.json", "leave --boxes out"),
+        ("--views r.csv m.ply --camera exif", "the rig holds the cameras"),
+        ("--views r.csv m.ply --mask m.png", "a rig takes no masks"),
     ],
 )
 def test_options_that_would_be_ignored_are_refused(words, said, capsys):

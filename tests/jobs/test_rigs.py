@@ -147,6 +147,7 @@ def test_every_photograph_of_colmap_is_read_with_and_without_lines_of_points(
     ("columns", "cells", "message"),
     [
         (",photo", ["b.png"], "header: two columns photo"),
+        (",mask,azimuth", ["m.png", 30], "header: a rig takes no azimuth, mask; leave these"),
         ("", ["5"], r"row 1: a\.png: '5' is beyond the last column"),
         (",qw,qx,qy,qz", [1, 0, 0, 0], r"row 1: a\.png: r11 to r33 and qw to qz"),
     ],

@@ -134,10 +134,10 @@ class BoxFile:
             )
         return found
 
-    def of_frame(self, name: str, size: Size) -> Corners | None:
-        """:meth:`box` of a frame of a video of (H, W), called as its picture would be; None if it
-        has none."""
-        return self._find(Path(name), lambda: PictureSize(size), owner="")
+    def of_frame(self, name: str, picture: PictureSize) -> Corners | None:
+        """:meth:`box` of a frame of a video, called as its picture would be; None if it has
+        none."""
+        return self._find(Path(name), lambda: picture, owner="")
 
     def _find(
         self, photo: Path, picture: Callable[[], PictureSize], *, owner: str
