@@ -1,7 +1,7 @@
 """Pairs of views that the shape of a mesh does not tell apart."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,8 +11,10 @@ from torch import Tensor
 from ..geometry import uniform_views, viewpoint_from_rotation
 from ..geometry.conversions import axis_angle_from_rotation, rotation_from_axis_angle
 from ..geometry.viewpoint import angles_between, up_rotation
-from ..matching import ViewBank, ViewDescriber
-from ..utils.aliases import Fields
+from ..matching import ViewDescriber
+from ..registration import Registrar
+from ..utils.aliases import Fields, Progress
+from .photographs import UPRIGHT
 
 LOOKED_AT = 48  # Directions from which the mesh is looked at
 RIVAL_ANGLE = 30.0  # Degrees beyond which a look-alike is another answer
@@ -22,9 +24,7 @@ TURNED = 2  # Candidates that are turned to come nearer
 # Degrees that a photograph resolves: poses look alike that differ by no more than a pose from
 # itself, turned so far
 RESOLUTION = 3.0
-HALF_TURNS = torch.stack(
-    [2.0 * torch.outer(axis, axis) - torch.eye(3).double() for axis in torch.eye(3).double()]
-)
+HALF_TURNS = torch.diag_embed(2.0 * torch.eye(3).double() - 1.0)  # about the mesh's axes
 STEEP = 60.0  # Degrees of elevation from which azimuth and roll can hardly be told apart
 # A print tells two views apart if in more than a fraction of their cells of so many pixels colours
 # differ by so much, of 1
@@ -89,32 +89,26 @@ def _angles_of(rotation: Tensor) -> dict[str, float]:
 
 
 @torch.no_grad()
-def look_alikes(
-    bank: ViewBank,
-    describer: ViewDescriber,
-    symmetries: Tensor | None,
-    *,
-    elevations: tuple[float, float] = (-90, 90),
-    report_progress: Callable[[int, int], object] = lambda *_: None,
-) -> tuple[LookAlike, ...]:
+def look_alikes(registrar: Registrar, report: Progress = lambda *_: None) -> tuple[LookAlike, ...]:
     """The most similar view beyond 30 degrees of each of 48 directions, spread evenly over the
-    sphere.
+    sphere; of an upright object, of those from which one looks at it.
 
     Candidates are views of the bank, and half turns about the axes of the mesh; the best are turned
-    until they are most similar. Descriptors are those by which poses
-    are compared with photographs.
+    until they are most similar. Descriptors are those by which poses are compared with photographs.
+    Symmetries of a mesh without colours do not count.
 
     Args:
-        bank: views of the mesh, among which candidates are looked for.
-        describer: of the mesh, with the descriptor of fitted poses.
-        symmetries: (S, 4, 4) rotations that do not count; None for none.
-        elevations: degrees between which the mesh is looked at, with its own up axis.
-        report_progress: called with directions done and in all.
+        registrar: of the mesh.
+        report: called with "look-alikes", directions done and in all.
     """
+    bank = registrar.bank
+    describer = registrar.describer
+    symmetries = None if bank.mesh.has_colours else registrar.symmetries_of(exact=True)
     directions = uniform_views(LOOKED_AT).rotations.double()
     up = up_rotation(bank.mesh.up).double()
-    elevation = viewpoint_from_rotation(directions @ up.mT)[1]
-    directions = directions[(elevation >= elevations[0]) & (elevation <= elevations[1])]
+    if registrar.pipeline.views.pose == "upright":
+        elevation = viewpoint_from_rotation(directions @ up.mT)[1]
+        directions = directions[(elevation >= UPRIGHT[0]) & (elevation <= UPRIGHT[1])]
     distance = bank.distances.median().double().cpu()
     descriptors = _described(describer, directions, distance)
     resolved = _resolved(describer, directions, distance, descriptors)
@@ -124,7 +118,7 @@ def look_alikes(
     similarity = (matched @ coarse.T).cpu()
     pairs = []
     for row, direction in enumerate(directions):
-        report_progress(row, len(directions))
+        report("look-alikes", row, len(directions))
         angle = _angle(views, direction, symmetries)
         scores = similarity[row].masked_fill(angle <= RIVAL_ANGLE + sum(STEPS), -torch.inf)
         best = scores.topk(min(CANDIDATES, len(scores))).indices
@@ -147,7 +141,7 @@ def look_alikes(
                 _hint(direction, rival, up),
             )
         )
-    report_progress(len(directions), len(directions))
+    report("look-alikes", len(directions), len(directions))
     return tuple(sorted(pairs, key=lambda pair: pair.resolved - pair.similarity))
 
 
@@ -207,7 +201,7 @@ def _turns(degrees: float) -> Tensor:
     """(6, 3, 3) turns about the three axes, in both directions."""
     axes = torch.eye(3, dtype=torch.float64)
     vectors = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64)) * torch.cat([axes, -axes])
-    return torch.stack([rotation_from_axis_angle(vector) for vector in vectors])
+    return rotation_from_axis_angle(vectors)
 
 
 def _resolved(

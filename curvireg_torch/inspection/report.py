@@ -4,7 +4,6 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -21,7 +20,7 @@ from ..utils.likes import ImageLike, MeshLike
 from ..utils.threads import one_torch_thread
 from .facts import MeshFacts, mesh_facts
 from .look_alikes import LookAlike, confused_sides, look_alikes
-from .photographs import SIZE, UPRIGHT, PhotographGenerator
+from .photographs import SIZE, PhotographGenerator
 from .trial import Trial, report_nothing, run_trial
 
 ELEVATIONS = (-90.0, -45.0, 0.0, 45.0, 90.0)  # Borders of the ranges of the report, degrees
@@ -220,7 +219,7 @@ def inspect(
                 clean, pipeline=pipeline, renderer=renderer, device=device, progress=report
             )
             registrar = Registrar(bank, mesh_is="exact", renderer=renderer)
-        pairs = look_alikes_of(registrar, report)
+        pairs = look_alikes(registrar, report)
         found = replace(found, pairs=pairs, registrar=registrar)
         if n == 0:
             return found
@@ -230,20 +229,6 @@ def inspect(
             registrar, generate, n, with_camera=with_camera, compare=compare, report=report
         )
         return replace(found, trial=trial)
-
-
-def look_alikes_of(registrar: Registrar, report: Progress) -> tuple[LookAlike, ...]:
-    """:func:`.look_alikes` of a registrar's mesh, from where its views are looked at; the stage is
-    called "look-alikes"."""
-    mesh = registrar.bank.mesh
-    upright = registrar.pipeline.views.pose == "upright"
-    return look_alikes(
-        registrar.bank,
-        registrar.describer,
-        None if mesh.has_colours else registrar.symmetries_of(exact=True),
-        elevations=UPRIGHT if upright else (-90.0, 90.0),
-        report_progress=partial(report, "look-alikes"),
-    )
 
 
 def _background(picture: ImageLike) -> Tensor:

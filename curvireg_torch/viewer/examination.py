@@ -5,7 +5,8 @@ import traceback
 
 from ..errors import CurviregError
 from ..inspection.facts import mesh_facts
-from ..inspection.report import Inspection, look_alikes_of
+from ..inspection.look_alikes import look_alikes
+from ..inspection.report import Inspection
 from ..jobs.options import RegisterOptions
 from ..mesh import Mesh
 from .session import Session, registrar_key
@@ -73,7 +74,7 @@ class Examination:
         if facts.is_hopeless:
             return Inspection(facts).in_brief
         registrar = self.session.open_registrar(key, self._report)
-        pairs = look_alikes_of(registrar, self._report)
+        pairs = look_alikes(registrar, self._report)
         return Inspection(facts, pairs).in_brief
 
     def close(self) -> None:

@@ -44,6 +44,12 @@ def plate(size, at):
     return trimesh.creation.box(size).apply_translation(at)
 
 
+def two_coloured(mesh, is_red):
+    """The mesh, with red and blue faces."""
+    mesh.visual.face_colors = np.where(is_red, (200, 30, 30, 255), (30, 30, 200, 255))
+    return mesh
+
+
 def check_warned(facts, *texts):
     for text in texts:
         assert any(text in warning for warning in facts.warnings)
@@ -187,11 +193,9 @@ def test_symmetry_deviation_grows_with_the_asymmetry():
 
 @pytest.mark.slow
 def test_a_half_hollow_box_looks_alike_from_above_and_not_from_below():
-    mesh = as_mesh(half_solid_box())
-    bank = bank_of(mesh)
-    registrar = Registrar(bank, mesh_is="exact")
+    registrar = Registrar(bank_of(half_solid_box()), mesh_is="exact")
     assert registrar.symmetries_of(exact=True) is None
-    pairs = look_alikes(bank, registrar.describer, None)
+    pairs = look_alikes(registrar)
     elevation = cr.viewpoint_from_rotation(torch.stack([pair.rotation for pair in pairs]))[1]
     alike = torch.tensor([pair.is_alike for pair in pairs])
     angle = torch.tensor([pair.angle for pair in pairs])
@@ -202,12 +206,10 @@ def test_a_half_hollow_box_looks_alike_from_above_and_not_from_below():
 
 def test_look_alikes_leave_out_symmetries(monkeypatch):
     monkeypatch.setattr("curvireg_torch.inspection.look_alikes.LOOKED_AT", 12)
-    box = as_mesh(trimesh.creation.box((1, 2, 3)))
-    bank = bank_around(box, 60, [-45, 0, 45], image_size=64)
-    registrar = Registrar(bank, mesh_is="exact")
+    bank = bank_around(trimesh.creation.box((1, 2, 3)), 60, [-45, 0, 45], image_size=64)
     counted, left_out = (
-        look_alikes(bank, registrar.describer, symmetries)
-        for symmetries in (None, registrar.symmetries_of(exact=True))
+        look_alikes(Registrar(bank, mesh_is="exact", symmetries=symmetries))
+        for symmetries in (eye(4)[None], None)
     )
     assert np.mean([pair.is_alike for pair in counted]) > 0.8
     assert np.mean([pair.is_alike for pair in left_out]) < 0.3
@@ -217,7 +219,7 @@ def test_look_alikes_leave_out_symmetries(monkeypatch):
 @pytest.mark.parametrize("clutter", slow_after(1, [False, True]))
 def test_photographs_depend_on_seed_and_number_alone(clutter):
     first, again, other = (
-        PhotographGenerator(example_mesh(), seed, clutter=clutter) for seed in (5, 5, 6)
+        PhotographGenerator(example_mesh(), seed, clutter=clutter) for seed in (5, 5, 10**15)
     )
     first(0)
     one = first(1)
@@ -287,8 +289,7 @@ def test_ranges_take_their_last_border_in():
 def test_photographs_of_many_faces_show_a_simplified_mesh(monkeypatch, is_coloured):
     fine = trimesh.creation.icosphere(5, 2.0)
     if is_coloured:
-        colours = np.where(fine.triangles_center[:, :1] > 0.0, (250, 0, 0, 255), (0, 0, 250, 255))
-        fine.visual.face_colors = colours
+        two_coloured(fine, fine.triangles_center[:, :1] > 0.0)
     fine.units = "cm"
     fine = replace(as_mesh(fine), up="y")
     assert photographed_mesh(fine) is fine
@@ -355,11 +356,6 @@ def test_settings_beside_a_registrar_are_refused(small_bank):
             cr.inspect(Registrar(small_bank), **option)
 
 
-def test_any_seed_gives_photographs():
-    generate = PhotographGenerator(trimesh.creation.box((1, 2, 3)), seed=10**15)
-    assert generate(0).image.any()
-
-
 def test_page_groups_symmetries_by_their_turn():
     can = mesh_facts(trimesh.creation.cylinder(0.3, 1.0, sections=72))
     page = report_page(Inspection(can), title="can")
@@ -378,16 +374,13 @@ def test_page_escapes_names(inspected):
 def test_symmetries_of_colours_are_told_from_those_of_shape():
     bands = trimesh.creation.cylinder(0.3, 1.0, sections=24).subdivide().subdivide()
     height = bands.triangles_center[:, 2]
-    bands.visual.face_colors = np.where(
-        height[:, None] > 0.2, (200, 30, 30, 255), (30, 30, 200, 255)
-    )
+    two_coloured(bands, height[:, None] > 0.2)
     assert len(look_symmetries(bands)) == 36, "no half turn upside down"
     facts = mesh_facts(bands)
     assert facts.is_coloured
     check_warned(facts, "body of revolution")
     label = bands.copy()
     beside = (bands.triangles_center[:, 0] > 0.2) & (np.abs(height) < 0.1)
-    label.visual.face_colors[beside] = (250, 250, 250, 255)
     label.visual.face_colors = np.where(beside[:, None], (250,) * 4, bands.visual.face_colors)
     assert len(look_symmetries(label)) == 1
     assert len(mesh_facts(label).symmetries) == 71
@@ -434,8 +427,7 @@ def test_a_print_tells_sides_of_a_box_apart_and_a_plain_one_does_not():
     front = middles[:, :1] > 0
     ends = np.abs(middles[:, 2:]) > 1
     for is_red, least, most in ((front, 0.5, 1.0), (ends, 0.0, 0.01)):
-        box.visual.face_colors = np.where(is_red, (200, 30, 30, 255), (30, 30, 200, 255))
-        bank = bank_of(as_mesh(box), views)
+        bank = bank_of(two_coloured(box, is_red), views)
         describer = Registrar(bank, mesh_is="exact").describer
         distance = bank.distances.median().double().cpu()
         assert least <= print_difference(describer, view, view @ HALF_TURN, distance) <= most
