@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 from ..matching.describe import VIEW_FACES
 from ..mesh import as_mesh, mesh_radius
 from ..mesh.mesh import extreme_points
+from ..mesh.sampling import surface_points
 from ..utils.aliases import Fields
 from ..utils.arrays import Floats
 from ..utils.choices import UNITS
@@ -222,7 +223,7 @@ def _size_warnings(size: float, unit: str | None) -> list[str]:
 
 def _is_sphere(mesh: trimesh.Trimesh) -> bool:
     """Whether all points of the surface are about as far from its middle."""
-    points = np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0])
+    points = surface_points(mesh, POINTS)
     distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
     return bool(distance.std() < SPHERE_SPREAD * distance.mean())
 

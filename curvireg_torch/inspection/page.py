@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from ..registration import Registrar
+from ..registration.confidence import two_decimals
+from ..utils.arrays import Bytes
 from ..visualization.contours import Drawn, draw_close_up
 from ..visualization.encoding import embedded, jpeg, to_uint8
 from .facts import CONTINUOUS_TURN, MeshFacts
@@ -152,7 +153,7 @@ def _pairs(report: Inspection) -> str:
 def _pair_figure(registrar: Registrar, pair: LookAlike) -> str:
     distance = registrar.bank.distances.median().cpu().expand(2)
     pictures = registrar.describer.shaded(torch.stack([pair.rotation, pair.rival]), distance)
-    images = "".join(_image(_picture(picture)) for picture in pictures)
+    images = "".join(_image(to_uint8(picture[-3:])) for picture in pictures)  # grey, or in colours
     verdict = "alike" if pair.is_alike else "different"
     told = f"its print and {pair.hint}" if pair.print_tells else pair.hint
     help = f"; {told} would tell" if pair.is_alike else ""
@@ -163,13 +164,8 @@ def _pair_figure(registrar: Registrar, pair: LookAlike) -> str:
     return f"<figure>{images}<figcaption>{caption}</figcaption></figure>"
 
 
-def _picture(shaded: Tensor) -> bytes:
-    """JPEG of a shaded view: (1, S, S) grey, or (4, S, S) grey and in colours."""
-    return jpeg(to_uint8(shaded[-3:] if len(shaded) > 1 else shaded.expand(3, -1, -1)), 85)
-
-
-def _image(content: bytes) -> str:
-    return f'<img alt="" src="{embedded(content)}">'
+def _image(picture: Bytes) -> str:
+    return f'<img alt="" src="{embedded(jpeg(picture, 85))}">'
 
 
 def _expectation(report: Inspection) -> str:
@@ -218,8 +214,8 @@ def _confusion_figure(outcome: Outcome, registrar: Registrar) -> str:
     drawn = Drawn(registrar.describer, outcome.result.projection)
     picture = draw_close_up(image, outcome.photograph.box.tolist(), PICTURE_SIDE, [drawn])
     confidence = outcome.result.confidence
-    said = "" if confidence is None else f", confidence {int(100 * confidence) / 100:.2f}"
+    said = "" if confidence is None else f", confidence {two_decimals(confidence)}"
     return (
-        f"<figure>{_image(jpeg(picture, 85))}<figcaption>{outcome.error_deg:.0f}° "
+        f"<figure>{_image(picture)}<figcaption>{outcome.error_deg:.0f}° "
         f"off{said}</figcaption></figure>"
     )

@@ -13,6 +13,7 @@ from ..geometry import rotation_error
 from ..mesh import Mesh, SurfaceColours, as_mesh, mesh_symmetries
 from ..mesh.colours import VARIED_BY, VARIED_FRACTION, colours_at
 from ..mesh.mesh import mesh_radius
+from ..mesh.sampling import surface_points
 from ..rendering.embree import RayScene
 from ..utils.aliases import Fields
 from ..utils.arrays import Floats, Integers
@@ -102,8 +103,7 @@ class _ColouredPoints:
         if mesh.colours is not None and mesh.has_colours:
             self.points, self.colours = coloured_points(mesh, mesh.colours, DENSER * POINTS)
         else:
-            sampled = trimesh.sample.sample_surface(mesh.surface, DENSER * POINTS, seed=0)
-            self.points = np.asarray(sampled[0])
+            self.points = surface_points(mesh.surface, DENSER * POINTS)
         self.tree = cKDTree(self.points)
         self.diameter = 2.0 * mesh_radius(mesh)
         self.some = self.points[::DENSER]

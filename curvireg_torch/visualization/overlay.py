@@ -197,7 +197,7 @@ def side_pictures(
     return {
         "photograph": to_uint8(crop[0]),
         "photograph field": _field_picture(field[0]),
-        "pose": to_uint8(shaded[-3:] if len(shaded) > 1 else shaded),
+        "pose": to_uint8(shaded[-3:]),
         "view field": _field_picture(registrar.describer.fields(*at)[0]),
     }
 
