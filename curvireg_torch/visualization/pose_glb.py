@@ -92,7 +92,7 @@ def scene_glb(
             raise InvalidInputError(
                 "T_cam_from_model: the object is behind the camera; check the pose"
             )
-        H, W = (int(n) for n in image.shape[-2:])
+        H, W = image.shape[-2:]
         world_from_camera = scale @ _FLIP @ np.linalg.inv(P.numpy())
         plane = _photograph_plane(image, K, depth + 1.05 * mesh_radius(mesh))
         scene.add_geometry(plane, node_name=f"picture {number}", transform=world_from_camera)
@@ -156,7 +156,7 @@ def _coloured(mesh: Mesh) -> trimesh.Trimesh:
 
 def _photograph_plane(image: Tensor, K: Tensor, depth: float) -> trimesh.Trimesh:
     """The photograph as a plane at a depth, in OpenCV's camera frame."""
-    H, W = (int(n) for n in image.shape[-2:])
+    H, W = image.shape[-2:]
     uv = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
     pixels = np.column_stack([W * uv[:, 0] - 0.5, H * (1.0 - uv[:, 1]) - 0.5, np.ones(4)])
     corners = depth * pixels @ np.linalg.inv(K.numpy()).T

@@ -115,11 +115,7 @@ class OverlayVideo(AbstractContextManager["OverlayVideo"]):
 
 def _frames_in(path: Path) -> int:
     """The number of frames that a video has by its index; 0 of a file that cannot be read."""
-    video = cv2.VideoCapture(str(path))
-    try:
-        return int(video.get(cv2.CAP_PROP_FRAME_COUNT)) if video.isOpened() else 0
-    finally:
-        video.release()
+    return max(0, int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)))
 
 
 def annotated_frame(
