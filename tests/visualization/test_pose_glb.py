@@ -10,11 +10,11 @@ import torch
 import trimesh
 from numpy.testing import assert_allclose
 
-from curvireg_torch.geometry import project_points, rotation_from_axis_angle
+from curvireg_torch.geometry import project_points, rotation_from_axis_angle, transform
 from curvireg_torch.mesh import as_mesh
 from curvireg_torch.visualization import pose_glb
 from curvireg_torch.visualization.pose_glb import scene_glb
-from tests._support import CAMERA, SIZE, eye, refused, scene
+from tests._support import CAMERA, SIZE, double, eye, refused, scene
 
 
 def tree_of(data):
@@ -22,11 +22,16 @@ def tree_of(data):
     return json.loads(data[20 : 20 + length])
 
 
+def placed(scene_of_file, node):
+    """The mesh of a node in the world."""
+    transform, name = scene_of_file.graph[node]
+    return scene_of_file.geometry[name].copy().apply_transform(transform)
+
+
 def project(points, tree):
     """Pixels of points in metres in the file's camera, which is at the origin and looks along
     -z."""
-    W = SIZE[1]
-    H = SIZE[0]
+    H, W = SIZE
     lens = tree["cameras"][0]["perspective"]
     up = 1 / np.tan(lens["yfov"] / 2)
     x = points[:, 0] / -points[:, 2] * up / lens["aspectRatio"]
@@ -42,30 +47,27 @@ def test_pose_glb_camera_projects_mesh_and_photograph(unit, metres):
     data = pose_glb(mesh, T, CAMERA, image)
     tree = tree_of(data)
     back = trimesh.load(BytesIO(data), file_type="glb")
-    parts = {back.graph[name][1]: back.graph[name][0] for name in back.graph.nodes_geometry}
-    boxes = [n for n in parts if len(back.geometry[n].faces) == 12]
-    points = trimesh.transform_points(back.geometry[boxes[0]].vertices, parts[boxes[0]])
+    points = placed(back, "object").vertices
     expected = project_points(
         torch.from_numpy(np.array(mesh.triangles.reshape(-1, 3))), T, CAMERA
     ).numpy()
     assert_allclose(project(points, tree), expected, atol=1e-2)
     extras = next(node for node in tree["nodes"] if "camera" in node)["extras"]
     assert (extras["T_cam_from_model"], extras["camera_matrix"]) == (T.tolist(), CAMERA.tolist())
-    depth = float((T[:3, 3])[2])
-    assert -points[:, 2].mean() == pytest.approx(depth * metres, rel=1e-3)
+    assert -points[:, 2].mean() == pytest.approx(float(T[2, 3]) * metres, rel=1e-3)
     # The corners of the photograph's plane are behind the mesh.
-    plane = next(n for n in parts if n not in boxes)
-    corners = trimesh.transform_points(back.geometry[plane].vertices, parts[plane])
+    plane = placed(back, "picture 0")
+    corners = plane.vertices
     H, W = SIZE
     expected = np.array([(-0.5, -0.5), (W - 0.5, -0.5), (W - 0.5, H - 0.5), (-0.5, H - 0.5)])
     assert_allclose(project(corners, tree), expected, atol=1e-2)
     assert corners[:, 2].max() < points[:, 2].min()
     # It faces the camera, and its top is the picture's top.
-    assert back.geometry[plane].face_normals[0] @ parts[plane][:3, :3].T @ [0, 0, 1] > 0
-    texture = back.geometry[plane].visual.material.baseColorTexture
+    assert plane.face_normals[0][2] > 0
+    texture = plane.visual.material.baseColorTexture
     shown = np.asarray(texture.convert("RGB"), float) / 255
     assert np.abs(shown - image.permute(1, 2, 0).numpy()).mean() < 0.03
-    assert_allclose(back.geometry[plane].visual.uv[0], [0, 1], atol=1e-6)
+    assert_allclose(plane.visual.uv[0], [0, 1], atol=1e-6)
 
 
 def test_pose_glb_keeps_vertex_colours():
@@ -101,28 +103,17 @@ def test_scene_glb_places_each_camera_where_its_photograph_was_taken():
     mesh.units = "mm"
     K = CAMERA.clone()
     K[1, 1] *= 1.25
-    poses = []
-    for degrees, shift in ((0.0, (0.1, 0.0, 0.0)), (25.0, (-0.2, 0.3, 0.1))):
-        pose = eye(4)
-        pose[:3, :3] = rotation_from_axis_angle(
-            torch.deg2rad(torch.tensor([0.1, 1.0, 0.3])) * degrees
-        ).double()
-        pose[:3, 3] = torch.tensor(shift)
-        poses.append(pose)
+    axis = torch.deg2rad(double([0.1, 1.0, 0.3]))
+    poses = [
+        transform(rotation_from_axis_angle(degrees * axis), double(shift))
+        for degrees, shift in ((0.0, (0.1, 0.0, 0.0)), (25.0, (-0.2, 0.3, 0.1)))
+    ]
     data = scene_glb(as_mesh(mesh), T, [(pose, K, image) for pose in poses])
     tree = tree_of(data)
-    back = trimesh.load(BytesIO(data), file_type="glb")
-    name = next(
-        n for n in back.graph.nodes_geometry if len(back.geometry[back.graph[n][1]].faces) == 12
-    )
-    world = trimesh.transform_points(
-        back.geometry[back.graph[name][1]].vertices, back.graph[name][0]
-    )
+    world = placed(trimesh.load(BytesIO(data), file_type="glb"), "object").vertices
     nodes = [node for node in tree["nodes"] if "camera" in node]
-    assert [(node["name"], node["camera"]) for node in nodes] == [
-        ("photograph 0", 0),
-        ("photograph 1", 1),
-    ]
+    names = [(node["name"], node["camera"]) for node in nodes]
+    assert names == [("photograph 0", 0), ("photograph 1", 1)]
     corners = torch.from_numpy(np.array(mesh.triangles.reshape(-1, 3)))
     for node, pose in zip(nodes, poses, strict=True):
         world_from_camera = np.array(node["matrix"]).reshape(4, 4).T  # glTF writes columns
