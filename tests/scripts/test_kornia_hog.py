@@ -7,6 +7,7 @@ from skimage.feature import hog
 from torch.autograd import gradcheck
 
 from scripts.kornia.hog import HistogramOfOrientedGradients, histogram_of_oriented_gradients
+from tests._support import uniform
 
 CELL = (6, 5)
 BLOCK = (2, 3)
@@ -14,16 +15,15 @@ BLOCK = (2, 3)
 
 def images(kind):
     """(2, 3, 45, 38) float64; 45 and 38 are no multiples of the cell."""
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.rand(2, 3, 45, 38, generator=generator, dtype=torch.float64)
-    y, x = torch.meshgrid(torch.arange(45), torch.arange(38), indexing="ij")
-    if kind == "random":
-        return noise
-    if kind == "constant":
-        return torch.full_like(noise, 0.4)
-    if kind == "checkerboard":
-        return ((x // 3 + y // 3) % 2).double().expand(2, 3, 45, 38).contiguous()
-    return (x + 2.0 * y).double().expand(2, 3, 45, 38).contiguous()  # ramp
+    noise = uniform(2, 3, 45, 38)
+    y, x = torch.meshgrid(torch.arange(45.0), torch.arange(38.0), indexing="ij")
+    pictures = {
+        "random": noise,
+        "constant": torch.tensor(0.4),
+        "checkerboard": (x // 3 + y // 3) % 2,
+        "ramp": x + 2.0 * y,
+    }
+    return pictures[kind].to(noise).expand_as(noise).contiguous()
 
 
 class TestHistogramOfOrientedGradients:

@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.registration.result import Axis
-from scripts._shared import measured
 from scripts.benchmark.make import PART_AREA, TWIN, Variants
 from scripts.calibration.misleading import (
     BARREL,
@@ -109,22 +109,11 @@ def test_other_kinds_change_the_mesh_alone(sample):
 
 
 def test_wrong_ones_are_counted_among_the_reliable():
-    def row(*, reliable, wrong, verdict="unsure", confidence=0.5, axis_is_right=False):
-        return {
-            "reliable": reliable,
-            "wrong": wrong,
-            "verdict": verdict,
-            "confidence": confidence,
-            "axis_is_right": axis_is_right,
-        }
-
-    rows = [
-        row(reliable=True, wrong=False, verdict="reliable", confidence=0.95),
-        row(reliable=True, wrong=True, verdict="reliable", confidence=0.95),
-        row(reliable=False, wrong=True, confidence=0.95),
-        row(reliable=False, wrong=True, verdict="reliable axis"),
-        row(reliable=False, wrong=True, verdict="reliable axis", axis_is_right=True),
-    ]
+    right = {"reliable": True, "wrong": False, "verdict": "reliable", "confidence": 0.95}
+    unsure = {"reliable": False, "wrong": True, "verdict": "unsure", "confidence": 0.95}
+    axis = unsure | {"verdict": "reliable axis", "confidence": 0.5}
+    rows = [right, right | {"wrong": True}, unsure]
+    rows += [axis | {"axis_is_right": is_right} for is_right in (False, True)]
     assert table_of(rows) == {
         "photographs": 5,
         "confident": 3,
@@ -179,27 +168,6 @@ def test_axes_are_right_within_their_tolerance():
     assert not axis_is_right(SimpleNamespace(axis=None), SimpleNamespace(round_axis=None), None)
 
 
-def test_finished_tasks_are_kept(tmp_path):
-    out = tmp_path / "rows.jsonl"
-    tasks = {f"[{k}, 'a']": k for k in (1, 2)}
-    assert measured(out, doubled, tasks, 1, "") == [{"value": 2}, {"value": 4}]
-    more = {"[3, 'a']": 3, **tasks}
-    assert measured(out, failing_beyond_two, more, 1, "") == [
-        {"value": 6},
-        {"value": 2},
-        {"value": 4},
-    ]
-
-
-def doubled(task):
-    return [{"value": 2 * task}]
-
-
-def failing_beyond_two(task):
-    assert task > 2, "it was finished"
-    return doubled(task)
-
-
 def test_a_variant_differs_in_one_part():
     shapes = Variants(Namespace(seed=112, models=12, cad="variant"))
     low, high = PART_AREA
@@ -208,8 +176,7 @@ def test_a_variant_differs_in_one_part():
     for obj_id in shapes.ids:
         shown = shapes.mesh(obj_id)
         variant = shapes.mesh(obj_id + TWIN)
-        sides = shown.triangles[:, 1:] - shown.triangles[:, :1]
-        area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+        area = trimesh.triangles.area(shown.triangles)
         if len(variant.triangles) < len(shown.triangles):
             left_out += 1
             kept = {tuple(triangle.ravel()) for triangle in variant.triangles}

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint
+from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from scripts._shared import RIGHT_DEG, commit, read_json, read_lines
@@ -24,7 +24,7 @@ from scripts.paper import measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
 from scripts.paper.measures import Estimate, bootstrap, share_near
-from tests._support import write_photo
+from tests._support import seeded, seen_from, write_photo
 
 SETTINGS = BankSettings(image_size=64)
 
@@ -37,17 +37,13 @@ def root(tmp_path_factory):
     folder.mkdir()
     mesh = example_mesh()
     mesh.export(folder / "mesh.ply")
-    K = camera_matrix(400.0, 400.0, 79.5, 59.5, dtype=torch.float64)
+    K = camera_matrix(400.0, 400.0, 79.5, 59.5)
+    grey = torch.full((3, 120, 160), 0.9)
     lines = ["image,x0,y0,x1,y1,azimuth,elevation,theta,distance"]
     for i, (azimuth, elevation) in enumerate([(60, 30), (210, 0)]):
-        T = torch.eye(4, dtype=torch.float64)
-        T[:3, :3] = rotation_from_viewpoint(float(azimuth), float(elevation)).double()
-        T[:3, 3] = -T[:3, :3] @ torch.from_numpy(mesh.bounds.mean(axis=0))
-        T[2, 3] += 5.0 * 0.5 * float(torch.tensor(mesh.extents).norm())
-        generator = torch.Generator().manual_seed(i)
-        background = torch.full((3, 120, 160), 0.9)
+        T = seen_from(mesh, float(azimuth), float(elevation), 5.0)
         image, box = synthesize_photograph(
-            mesh, T, K, (120, 160), generator, background=background, texture=0.0
+            mesh, T, K, (120, 160), seeded(i), background=grey, texture=0.0
         )
         write_photo(folder / f"{i}.png", image)
         lines.append(f"{i}.png,{','.join(f'{v:g}' for v in box.tolist())},{azimuth},{elevation},0,")
@@ -362,15 +358,13 @@ def test_steps_are_evaluated_once(pascal, tmp_path, monkeypatch, capsys):
 
 
 def test_objects_without_a_pose_count_as_wrong(pascal, tmp_path, monkeypatch, capsys):
-    found = SimpleNamespace(
-        errors={
-            "a": {"symmetric_error_deg": math.inf, "error_deg": 5.0},
-            "b": {"symmetric_error_deg": 29.0, "error_deg": 90.0},
-            "c": {"symmetric_error_deg": math.nan, "error_deg": 5.0},
-        }
-    )
+    errors = [
+        {"symmetric_error_deg": math.inf, "error_deg": 5.0},
+        {"symmetric_error_deg": 29.0, "error_deg": 90.0},
+        {"symmetric_error_deg": math.nan, "error_deg": 5.0},
+    ]
     keys = [entry.key for entry in staircase.benchmark_of(pascal.root).entries]
-    found.errors = dict(zip(keys, found.errors.values(), strict=False))
+    found = SimpleNamespace(errors=dict(zip(keys, errors, strict=False)))
     monkeypatch.setattr(staircase, "evaluate", lambda *_, **__: {"skipped": {}})
     monkeypatch.setattr(staircase, "read_run", lambda _: found)
     climb(monkeypatch, tmp_path, f"mini={pascal.root}", "--steps", "3")
