@@ -146,6 +146,21 @@ def run_command(words, monkeypatch):
     return cli.main()
 
 
+def run_steps(page, monkeypatch, capsys):
+    """Run the steps of a page but the skipped ones: of each the words, none of Python, the exit
+    code or message, and what it prints."""
+    names = {"__name__": "page"}
+    for kind, text in steps(page):
+        capsys.readouterr()
+        if kind == "python":
+            exec(compile(text, page.name, "exec"), names)
+            yield [], 0, capsys.readouterr()
+        elif not any(re.match(start, re.sub(r"\s+#.*", "", text)) for start in SKIPPED):
+            words = split_command(text)
+            code = run_command(words, monkeypatch)
+            yield words, code, capsys.readouterr()
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_commands_of_a_page_have_the_options_and_blocks_of_python_are_python(page):
     for kind, text in steps(page):
@@ -166,26 +181,16 @@ def test_commands_of_a_page_have_the_options_and_blocks_of_python_are_python(pag
     ids=lambda p: str(p.relative_to(ROOT)),
 )
 def test_page_runs(page, monkeypatch, capsys):
-    names = {"__name__": "page"}
-    for kind, text in steps(page):
-        if kind == "python":
-            exec(compile(text, page.name, "exec"), names)
-        elif not any(re.match(start, re.sub(r"\s+#.*", "", text)) for start in SKIPPED):
-            words = split_command(text)
-            expected = int("datasets/verify.py" in words and not set(words).isdisjoint(DEFECTIVE))
-            assert run_command(words, monkeypatch) == expected, (text, capsys.readouterr().err)
-            if (
-                "register" in words
-                and "photo.jpg" in words
-                and not any(word.startswith("--up=") for word in words)
-            ):
-                result = json.loads(Path("out/part/result.json").read_text("utf-8"))
-                R = double(result["rotation"])
-                # without a camera R is allocentric
-                allowed = 20 if result["translation"] is None else 5
-                assert rotation_error(R, pose(30.0)[:3, :3]) < allowed
-    for name in re.findall(r"`((?:out|results)/[\w/.]+\.\w+)`", page.read_text(encoding="utf-8")):
-        assert Path(name).is_file(), f"the page promises {name}"
+    for words, code, printed in run_steps(page, monkeypatch, capsys):
+        expected = int("datasets/verify.py" in words and not set(words).isdisjoint(DEFECTIVE))
+        assert code == expected, (words, printed.err)
+        if {"register", "photo.jpg"} <= set(words) and "--up=" not in " ".join(words):
+            result = json.loads(Path("out/part/result.json").read_text("utf-8"))
+            R = double(result["rotation"])
+            # without a camera R is allocentric
+            allowed = 20 if result["translation"] is None else 5
+            assert rotation_error(R, pose(30.0)[:3, :3]) < allowed
+    check_promised(page)
 
 
 @pytest.mark.slow
@@ -196,17 +201,12 @@ def test_the_first_pages_run_on_the_files_of_the_demo_alone(
     """Typed as they stand, in a folder that holds nothing else."""
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
     monkeypatch.chdir(tmp_path)
-    names = {"__name__": "page"}
     registered = 0
-    for kind, text in steps(page):
-        if kind == "python":
-            capsys.readouterr()
-            exec(compile(text, page.name, "exec"), names)
-            check_printed(page, capsys.readouterr().out)
-        elif not any(re.match(start, re.sub(r"\s+#.*", "", text)) for start in SKIPPED):
-            words = split_command(text)
-            assert run_command(words, monkeypatch) == 0, (text, capsys.readouterr().err)
-            registered += "register" in words
+    for words, code, printed in run_steps(page, monkeypatch, capsys):
+        assert code == 0, (words, printed.err)
+        registered += "register" in words
+        if not words:
+            check_printed(page, printed.out)
     demo, found = (
         json.loads(path.read_text()) for path in sorted(Path("out").glob("*/result.json"))
     )
@@ -214,7 +214,12 @@ def test_the_first_pages_run_on_the_files_of_the_demo_alone(
         torch.tensor(rotation) for rotation in (found["rotation"], demo["truth"]["rotation"])
     )
     assert (registered, float(rotation_error(R, truth)) < 5.0) == (1, True)
-    for name in re.findall(r"`(out/[\w/.]+\.\w+)`", page.read_text(encoding="utf-8")):
+    check_promised(page)
+
+
+def check_promised(page):
+    """The files that a page names are there."""
+    for name in re.findall(r"`((?:out|results)/[\w/.]+\.\w+)`", page.read_text(encoding="utf-8")):
         assert Path(name).is_file(), f"the page promises {name}"
 
 
