@@ -255,18 +255,18 @@ class Furniture(Packages):
 
     def _siblings(self, obj_id: int) -> list[int]:
         own = self.rows[obj_id]
-        found = []
-        for other, row in self.rows.items():
-            is_of_kind = own["kind"] and row["kind"] == own["kind"]
-            if is_of_kind and row["like"] != own["like"]:
-                found.append(other)
-        return found
+        return [
+            other
+            for other, row in self.rows.items()
+            if own["kind"] and row["kind"] == own["kind"] and row["like"] != own["like"]
+        ]
 
     def similar(self, obj_id: int, rng: Rng) -> int:
         own = self._proportions(obj_id)
-        gaps = {}
-        for other in self._siblings(obj_id):
-            gaps[other] = np.exp(np.abs(own - self._proportions(other)).max())
+        gaps = {
+            other: np.exp(np.abs(own - self._proportions(other)).max())
+            for other in self._siblings(obj_id)
+        }
         limit = max(MAX_PROPORTION, min(gaps.values()))
         return int(rng.choice([k for k, gap in gaps.items() if gap <= limit]))
 

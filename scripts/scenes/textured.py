@@ -337,23 +337,21 @@ def render(
         rows = x.reshape(h, w, -1).astype(np.float32)
         return cv2.resize(rows, (W, H), interpolation=cv2.INTER_AREA)
 
-    annotated = [k for k, shape in enumerate(shapes) if shape.obj_id is not None]
-    seen = np.zeros((len(annotated), H, W), bool)
-    whole = np.zeros((len(annotated), H, W), bool)
-    first = np.zeros(h * w, np.float32)
-    for i, k in enumerate(annotated):
-        mask = np.zeros(h * w, np.float32)
-        mask[hit[seen_by_ray[0] == k]] = 1.0
-        seen[i] = shrink(mask) > 0.5
+    def depth_alone(k: int) -> Array:
         near = _in_box(pixels, shapes[k].hull @ R.T + t, zoomed)
         alone = np.zeros(h * w, np.float32)
         if near.any():
             distance = _rays(corners[k]).distance(start[near], rays[near])
             alone[near] = np.nan_to_num(distance, posinf=0.0)
-        whole[i] = shrink(alone > 0) > 0.5
-        if i == 0:
-            first = alone
-    flat_depth = cv2.resize(first.reshape(h, w), (W, H), interpolation=cv2.INTER_NEAREST)
+        return alone
+
+    owner = np.full(h * w, -1)
+    owner[hit] = seen_by_ray[0]
+    annotated = [k for k, shape in enumerate(shapes) if shape.obj_id is not None]
+    alone = [depth_alone(k) for k in annotated]
+    seen = np.array([shrink(owner == k) > 0.5 for k in annotated])
+    whole = np.array([shrink(depth > 0) > 0.5 for depth in alone])
+    flat_depth = cv2.resize(alone[0].reshape(h, w), (W, H), interpolation=cv2.INTER_NEAREST)
     return Picture(shrink(picture), seen, whole, flat_depth)
 
 
