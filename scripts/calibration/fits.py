@@ -1,6 +1,7 @@
 """Fits of confidences to measured rows, and how well they tell what is right."""
 
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -101,14 +102,9 @@ def fit_shares(rows: Sequence[Record], weight: Array, *, ties: bool) -> Record:
     pose is right and some are not; without ``ties`` the resolution is 0."""
     decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT_DEG]
 
-    most = max((len(rows[k]["scores"]) for k in decided), default=1)
-
     def filled(name: str, value: float) -> Array:
-        table = np.full((len(decided), most), value)
-        for place, k in enumerate(decided):
-            known = rows[k][name]
-            table[place, : len(known)] = known
-        return table
+        columns = zip_longest(*(rows[k][name] for k in decided), fillvalue=value)
+        return np.array([*columns], ndmin=2).T.copy()
 
     scores = filled("scores", -np.inf)
     behind = scores.max(axis=1, keepdims=True) - scores

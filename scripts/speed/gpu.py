@@ -21,12 +21,11 @@ from torch import Tensor
 import curvireg_torch as cr
 from curvireg_torch.matching import ViewMatcher
 from curvireg_torch.synthetic import example_mesh
-from scripts import _shared
+from scripts._shared import Record, processor, run, stamp, write_json
 from scripts.speed.speed import Photographs, dented_sphere
 
 AGREE = 4  # photographs that are also registered on the CPU
 TOGETHER = (1, 8, 64)  # photographs in one call
-Record = dict[str, Any]
 
 
 def rate(function: Callable[[], object], count: int) -> Record:
@@ -124,19 +123,15 @@ def main(
     photographs: int = 64,
     few_views: bool = False,
 ) -> None:
-    measured = {
-        **_shared.stamp(),
-        "processor": _shared.processor(device),
-        "torch": torch.__version__,
-    }
+    measured = stamp() | {"processor": processor(device), "torch": torch.__version__}
 
     def record(name: str, value: Any) -> None:
         measured[name] = value
         print(name, json.dumps(value), flush=True)
-        _shared.write_json(out, measured)
+        write_json(out, measured)
 
     measure(photographs, device, few_views=few_views, record=record)
 
 
 if __name__ == "__main__":
-    _shared.run(main)
+    run(main)

@@ -33,7 +33,6 @@ from typing import Any, Literal
 
 from scripts import _shared
 
-ROOT = Path(__file__).resolve().parents[2]
 STEPS = ("warm", "bank", "fresh", "one", "repeated", "many", "follow")
 FRAMES = 12
 EARLIER = 10  # photographs that an earlier command registered
@@ -207,7 +206,7 @@ def compare(
     found = {name: {} for name in checkouts}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        environment = {**os.environ, "PYTHONPATH": str(_shared.REPOSITORY)}
         command = f"{HERE}; write_inputs({temporary!r}, {photographs})"
         run_process(["-c", command], folder, environment)
         for name, checkout in checkouts.items():
@@ -261,7 +260,7 @@ def main(
     rounds: int = 3,
 ) -> None:
     checkouts = {"before": against.resolve()} if against else {}
-    checkouts["now"] = ROOT
+    checkouts["now"] = _shared.REPOSITORY
     record = {
         "date": _shared.today(),
         "commits": {name: _shared.commit(root) for name, root in checkouts.items()},
