@@ -23,7 +23,8 @@ def write(folder, suffix):
     if suffix == "gltf":
         tree = textured({})
         tree.content["images"] = [{"uri": "picture.png"}]
-        tree.write(path, folder / "points.bin")
+        (folder / "points.bin").write_bytes(tree.data)
+        tree.write(path, "points.bin")
     elif suffix == "obj":
         (folder / "part.mtl").write_text("newmtl skin\nmap_Kd picture.png\n")
         points = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"

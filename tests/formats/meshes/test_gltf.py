@@ -60,14 +60,13 @@ class Tree:
         uri = "data:image/png;base64," + base64.b64encode(encoded(pixels)).decode()
         self.content |= {"images": [{"uri": uri}], "textures": [{"source": 0}]}
 
-    def write(self, path, data=None):
-        """The path of the file, whose data are in another one, or in itself."""
-        uri = "data:;base64," + base64.b64encode(self.data).decode()
-        if data is not None:
-            data.write_bytes(self.data)
-            uri = data.name
-        self.content["buffers"] = [{"byteLength": len(self.data), "uri": uri}]
-        path.write_text(json.dumps(self.content))
+    def whole(self, uri=None):
+        """The content, whose data are in a file, or in itself."""
+        uri = uri or "data:;base64," + base64.b64encode(self.data).decode()
+        return {**self.content, "buffers": [{"byteLength": len(self.data), "uri": uri}]}
+
+    def write(self, path, uri=None):
+        path.write_text(json.dumps(self.whole(uri)))
         return path
 
 
@@ -186,12 +185,9 @@ def test_vertex_colours_are_multiplied_by_the_material(loaded, dtype, largest, f
     metallic = {"metallicFactor": 0, **({} if factor is None else {"baseColorFactor": factor})}
     tree.content["materials"] = [{"pbrMetallicRoughness": metallic}]
     mesh = loaded(tree)
-    found = mesh.colours
-    assert found is not None
-    assert mesh.has_colours
     tint = [0.7354, 1.0, 0.0] if factor and factor[0] == 0.5 else 1.0  # 0.5 as sRGB
     expected = 255 * colours[BOX.faces][..., :3] * tint
-    assert_allclose(found.corners, expected, atol=1.0)
+    assert_allclose(mesh.colours.corners, expected, atol=1.0)
 
 
 TRANSFORMS = """

@@ -1,10 +1,7 @@
 """Small files cannot make a reader work or hold much: what grows, and with what, is counted."""
 
-import base64
-import json
 import tracemalloc
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -23,11 +20,10 @@ from tests._support.refusals import refused
 from tests._support.spies import spied
 from tests.formats.meshes.packages import mesh_of_robot, robot
 from tests.formats.meshes.packages import threemf as write_package
-from tests.formats.meshes.pictures import encoded, painted
+from tests.formats.meshes.pictures import painted
 from tests.formats.meshes.step import step_file
 from tests.formats.meshes.test_cad import collada
-from tests.formats.meshes.test_gltf import skinned
-from tests.formats.meshes.test_hostile_meshes import tree
+from tests.formats.meshes.test_gltf import skinned, textured
 
 UNUSED = 10_000  # vertices
 PICTURE = painted((200, 100, 50))
@@ -103,78 +99,39 @@ def test_copies_of_a_part_do_not_hold_its_unused_vertices(tmp_path, suffix):
     assert peaks[1] - peaks[0] < UNUSED  # bytes: less than one for each vertex
 
 
-def part_of_image(count, image, **more):
-    """``count`` parts with a material of their own, which share an image."""
-    content = tree(
-        nodes=[{"mesh": k} for k in range(count)],
-        scenes=[{"nodes": list(range(count))}],
-        meshes=[
-            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": k}]}
-            for k in range(count)
-        ],
-        materials=[
-            {"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(count)
-        ],
-        textures=[{"source": 0}] * count,
-        images=[image],
-        **more,
-    )
-    content["accessors"].append(
-        {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}
-    )
-    return content
-
-
-def data_uri(picture):
-    return {"uri": f"data:image/png;base64,{base64.b64encode(picture).decode()}"}
-
-
-def test_a_texture_is_decoded_once(write, monkeypatch):
-    """Few bytes unpack to a large picture, which many parts share."""
-    picture = encoded(np.full((1024, 1024, 3), (200, 100, 50), np.uint8))
-    content = part_of_image(20, data_uri(picture))
-    content["nodes"] = [{"mesh": i % 20, "translation": [i, 0, 0]} for i in range(40)]
-    content["scenes"] = [{"nodes": list(range(40))}]
-    decode = Mock(wraps=colours._texture)
-    monkeypatch.setattr(colours, "_texture", decode)
-    found = cr.load_mesh(write("a.gltf", json.dumps(content))).colours
-    assert (decode.call_count, len(found)) == (1, 40)
-    (texture,) = found.textures
-    assert texture[9, 9].tolist() == [200, 100, 50]
-
-
-def test_bytes_of_a_shared_image_are_made_once(tmp_path, monkeypatch):
-    points = tree()["buffers"][0]
-    views = [*tree()["bufferViews"], {"buffer": 1, "byteLength": len(PICTURE)}]
-    decode = Mock(wraps=gltf._data_of)
-    monkeypatch.setattr(gltf, "_data_of", decode)
-    viewed = spied(monkeypatch, gltf._File, "_view")
-    path = tmp_path / "a.gltf"
-    for count in (5, 10):
-        decode.reset_mock()
-        path.write_text(json.dumps(part_of_image(count, data_uri(PICTURE))))
-        assert len(cr.load_mesh(path).colours.textures) == 1
-        assert decode.call_count == 2  # the buffer and the image
-        viewed.clear()
-        buffers = [points, {**data_uri(PICTURE), "byteLength": len(PICTURE)}]
-        shared = part_of_image(count, {"bufferView": 1}, buffers=buffers, bufferViews=views)
-        path.write_text(json.dumps(shared))
-        assert len(cr.load_mesh(path).colours.textures) == 1
-        assert [index for _, index in viewed].count(1) == 1
+def test_an_image_of_many_parts_is_read_and_decoded_once(loaded, monkeypatch):
+    """From a text, and from a view as in GLB."""
+    tree = textured({})
+    (part,) = tree.content["meshes"][0]["primitives"]
+    materials = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(20)]
+    tree.content |= {
+        "meshes": [{"primitives": [{**part, "material": k} for k in range(20)]}],
+        "materials": materials,
+        "textures": [{"source": 0}] * 20,
+    }
+    view = tree.array(np.frombuffer(PICTURE, np.uint8), "B")
+    for image, texts, views in ((*tree.content["images"], 2, 0), ({"bufferView": view}, 1, 1)):
+        tree.content["images"] = [image]
+        with monkeypatch.context() as patch:
+            of_texts = spied(patch, gltf, "_data_of")  # of the buffer too
+            of_views = spied(patch, gltf._File, "_view")
+            decoded = spied(patch, colours, "_texture")
+            found = loaded(tree).colours
+        assert (len(found), len(found.textures), len(decoded)) == (20, 1, 1)
+        assert (len(of_texts), [index for _, index in of_views].count(view)) == (texts, views)
 
 
 def test_joints_of_a_skin_are_placed_once(tmp_path, monkeypatch):
     joints = spied(monkeypatch, gltf._File, "_joints")
-    placed = Mock(wraps=np.stack)
+    placed = spied(monkeypatch, gltf.np, "stack")
     whole = skinned([0] * 4, [1, 0, 0, 0], {"translation": [0, 0, 2]})
     whole.content["nodes"] += [{"mesh": 0, "skin": 0}] * 19
     whole.content["scenes"] = [{"nodes": list(range(21))}]
-    monkeypatch.setattr(gltf.np, "stack", placed)
     monkeypatch.setattr(gltf, "SKINNED_AT_ONCE", 2)  # blocks of one part
     found = files.read_source(MeshSource(whole.write(tmp_path / "a.gltf")))
     assert (found.vertices[:, 2] == 2.0).all()
     assert found.vertices[:3].tolist() == [[0, 0, 2], [1, 0, 2], [0, 1, 2]]
-    assert (len(joints), placed.call_count) == (20, 1)
+    assert (len(joints), len(placed)) == (20, 1)
     whole.content["skins"] = [{"joints": [1] * 100_001}]
     with refused("more than 100,000 joints", MeshError):
         cr.load_mesh(whole.write(tmp_path / "a.gltf"))
@@ -253,11 +210,9 @@ def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(
         f'<material id="m{k}"><instance_effect url="#fx"/></material>' for k in range(5)
     )
     path.write_text(text.replace("</library_materials>", f"{materials}</library_materials>"))
-    decode = Mock(wraps=colours._texture)
-    monkeypatch.setattr(source, "texture_pixels", Mock(wraps=source.texture_pixels))
+    decoded = spied(monkeypatch, source, "texture_pixels")
     files.read_source(MeshSource(path))
-    assert source.texture_pixels.call_count == 1
-    assert decode.call_count == 0
+    assert len(decoded) == 1
     copies = '<instance_geometry url="#g"/>' * 4
     skin = '<controller id="c"><skin source="#g"/></controller>'
     for more in (copies, '<instance_controller url="#c"/>' * 4):

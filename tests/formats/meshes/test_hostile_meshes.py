@@ -1,6 +1,5 @@
 """Malicious mesh files end in a one-line error, soon and in little memory."""
 
-import base64
 import json
 import math
 import struct
@@ -16,23 +15,16 @@ from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import limits, polygons, source
 from curvireg_torch.mesh import mesh as mesh_module
 from tests._support.tables import text_table
+from tests.formats.meshes.test_gltf import TRIANGLE, Tree
 
-POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
+POINTS = np.array(TRIANGLE, "<f4").tobytes()
 
 
 def tree(**changes):
     """A triangle as glTF."""
-    whole = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
-        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}],
-        "buffers": [{"byteLength": 36, "uri": "data:;base64," + base64.b64encode(POINTS).decode()}],
-    }
-    return {**whole, **changes}
+    content = Tree()
+    content.part(None, TRIANGLE)
+    return {**content.whole(), **changes}
 
 
 def glb(content):
