@@ -248,22 +248,6 @@ def test_plain_materials_and_coordinates_without_a_texture_are_no_print():
     assert not plain.has_colours
 
 
-def test_meshes_far_away_and_with_stray_geometry_warn(tmp_path):
-    mesh = dino()
-    mesh.apply_translation([4.4e6, 5.1e5, 4.6e6])
-    mesh.export(tmp_path / "utm.ply")
-    texts = loaded(tmp_path / "utm.ply", unit="mm")[1]
-    assert "its coordinates are rounded to steps of 0.5: move the object near the origin" in texts
-    stray = dino()
-    corners = stray.bounds[1] + [300.0, 0.0, 0.0] + [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
-    extra = trimesh.Trimesh(corners, [[0, 1, 2]], process=False)
-    trimesh.util.concatenate([stray, extra]).export(tmp_path / "stray.ply")
-    found, texts = loaded(tmp_path / "stray.ply", unit="mm")
-    assert "of 19,995 faces 1 near (336.7, 36.82, 43.37)" in texts
-    assert "apart from the rest: left out" in texts
-    assert_allclose(found.extents, stray.extents, atol=1e-3)
-
-
 def bop_set(tmp_path, name, scale=1.0):
     """The set of a case, with the model that was left out of it."""
     root = shutil.copytree(real_case(name) / "set", tmp_path / "set")

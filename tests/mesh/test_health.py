@@ -1,17 +1,17 @@
 """Left-over parts far away, rounded coordinates, and colours that do not vary."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose
 
 import curvireg_torch as cr
-from curvireg_torch.mesh import Mesh, mesh_centre, mesh_radius, mesh_symmetries
+from curvireg_torch.mesh import Mesh, mesh_centre, mesh_radius
 from curvireg_torch.mesh.colours import SurfaceColours
 from curvireg_torch.mesh.health import stray_faces
 from curvireg_torch.mesh.mesh import as_mesh
+from curvireg_torch.synthetic import example_mesh
+from tests._support import answer_to, bank_around, unrefined
 
 SIDES = (60.0, 40.0, 30.0)
 
@@ -128,9 +128,7 @@ def coloured(**visual):
 def test_colours_that_do_not_vary_are_none():
     faces = len(trimesh.creation.cylinder(30.0, 100.0, sections=96).faces)
     for shade in (0, 100, 255):
-        mesh = coloured(face_colors=np.full((faces, 3), shade, np.uint8))
-        assert not mesh.has_colours
-        assert len(mesh_symmetries(mesh)) == 72
+        assert not coloured(face_colors=np.full((faces, 3), shade, np.uint8)).has_colours
     noise = np.random.default_rng(0).integers(0, 8, (faces, 3), np.uint8) + 100
     assert not coloured(face_colors=noise).has_colours
     one = np.full((faces, 3), 100, np.uint8)
@@ -153,23 +151,17 @@ def test_a_texture_counts_if_a_word_of_it_differs(fraction):
     assert Mesh(mesh, colours=colours).has_colours == (fraction > 0.002)
 
 
-def test_notes_reach_the_result(tmp_path):
-    scene = cr.synthetic.demo_scene()
-    stray = triangle(0.001 * mesh_radius(scene.mesh), (9.0 * mesh_radius(scene.mesh), 0.0, 0.0))
-    mesh = as_mesh(
-        joined(trimesh.Trimesh(scene.mesh.vertices, scene.mesh.faces, process=False), stray)
-    )
-    views = cr.sample_views(azimuth_step=60, elevations=[20])
-    bank = cr.ViewBank.build(mesh, views, image_size=64, progress=False)
-    bank.save(tmp_path / "bank.safetensors")
-    for one in (bank, cr.ViewBank.load(tmp_path / "bank.safetensors")):
-        registrar = cr.Registrar(one, pipeline=replace(one.pipeline, contours=False, search=False))
-        result = registrar([scene.image], [scene.box], scene.camera_matrix)[0]
-        (text,) = result.to_dict()["warnings"]
-        assert "apart from the rest: left out" in text
-        assert result.notes == (text,)
-        assert result.warnings == (), "the pose is no less reliable"
-        assert text in repr(result)
+def test_notes_reach_the_result():
+    truck = example_mesh()
+    radius = mesh_radius(truck)
+    mesh = as_mesh(joined(truck, triangle(0.001 * radius, (9.0 * radius, 0.0, 0.0))))
+    bank = bank_around(mesh, 60, [20], image_size=64)
+    result = answer_to(0, cr.Registrar(bank, pipeline=unrefined(bank)))
+    (text,) = result.to_dict()["warnings"]
+    assert "apart from the rest: left out" in text
+    assert result.notes == (text,)
+    assert result.warnings == (), "the pose is no less reliable"
+    assert text in repr(result)
 
 
 def test_a_part_of_half_a_percent_is_no_leftover():

@@ -76,21 +76,6 @@ def test_load_mesh_notes_the_up_axis(tmp_path, suffix, up):
         cr.load_mesh(path, up="w")
 
 
-def test_welding_joins_vertices_at_one_place_and_drops_faces_twice_or_without_area():
-    box = trimesh.creation.box((1, 2, 3))
-    apart = np.asarray(box.vertices)[box.faces].reshape(-1, 3) + 1e-8 * np.arange(36)[:, None]
-    faces = np.arange(36).reshape(12, 3)
-    faces = np.concatenate([faces, faces[:2, ::-1], [[0, 0, 1]]])  # twice, turned over, and a line
-    vertices, faces = simplified(
-        trimesh.Trimesh(apart, faces, process=False), np.array([0.5, 0.0, 0.0]), 100
-    )
-    expected = np.asarray(box.vertices) - [0.5, 0, 0]
-    assert sorted(vertices.round(3).tolist()) == sorted(expected.tolist())
-    welded = trimesh.Trimesh(vertices, faces, process=False)
-    assert (len(faces), welded.is_watertight) == (12, True)
-    assert welded.volume == pytest.approx(6.0, rel=1e-5)
-
-
 def test_a_surface_encloses_volumes_where_each_edge_has_two_faces_of_one_orientation():
     box = trimesh.creation.box()
     corners = np.asarray(box.vertices)
@@ -154,29 +139,15 @@ def test_load_mesh_warns_of_the_size(tmp_path, recwarn, size, count):
     assert all("m across; if that is wrong, give the unit" in str(one) for one in messages)
 
 
-def test_places_of_parts_are_multiplied_from_the_root():
-    """A part moved along x below a node that turns x to y: products in the other order put it
-    elsewhere."""
-    quarter = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1])
-    scene = trimesh.Scene()
-    scene.graph.update("turned", "world", matrix=quarter)
-    moved = trimesh.transformations.translation_matrix([10.0, 0.0, 0.0])
-    scene.add_geometry(
-        trimesh.creation.box((3.0, 2.0, 1.0)),
-        node_name="part",
-        parent_node_name="turned",
-        transform=moved,
-    )
-    expected = [[-1.0, 8.5, -0.5], [1.0, 11.5, 0.5]]
-    assert_allclose(as_mesh(scene).bounds, expected, atol=1e-9)
-
-
-def test_a_mirrored_part_of_a_scene_keeps_the_colours_of_its_corners():
+def test_a_part_of_a_scene_is_moved_and_mirrored_with_the_colours_of_its_corners():
     """Its faces are turned over, and the colours of their corners with them."""
     box = trimesh.creation.box((2.0, 2.0, 2.0))
     box.visual.vertex_colors = np.where(box.vertices > 0, 255, 0).astype(np.uint8)
-    mesh = as_mesh(trimesh.Scene(box).apply_transform(np.diag([1.0, -1.0, 1.0, 1.0])))
-    corners = mesh.vertices[mesh.faces] * [1.0, -1.0, 1.0]
+    place = np.diag([1.0, -1.0, 1.0, 1.0])
+    place[:3, 3] = 5.0
+    mesh = as_mesh(trimesh.Scene(box).apply_transform(place))
+    corners = (mesh.vertices[mesh.faces] - 5.0) * [1.0, -1.0, 1.0]
+    assert_allclose(mesh.bounds, [[4.0] * 3, [6.0] * 3])
     np.testing.assert_array_equal(mesh.colours.corners, np.where(corners > 0, 255, 0))
     assert mesh.surface.volume == pytest.approx(8.0)
 

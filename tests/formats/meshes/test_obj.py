@@ -4,12 +4,10 @@ import argparse
 
 import numpy as np
 import pytest
-import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.cli.options import MESH, add_options, register_options
 from curvireg_torch.errors import MeshError, MissingFileError
-from curvireg_torch.mesh import mesh_symmetries
 from tests._support.refusals import refused
 from tests._support.tables import text_table
 from tests.formats.meshes.pictures import encoded, noise
@@ -191,20 +189,6 @@ def test_an_obj_of_many_parts_is_refused(write):
         path = write("a.obj", POINTS + "".join(f"{key} p{k}\nf 1 2 3\n" for k in range(10_001)))
         with refused("more than 10,000 parts; join them", MeshError):
             cr.load_mesh(path)
-
-
-def test_a_can_of_two_materials_that_look_alike_is_grey(write):
-    """No print, and all its symmetries."""
-    can = trimesh.creation.cylinder(30.0, 100.0, sections=96)
-    points = "".join(f"v {x} {y} {z}\n" for x, y, z in can.vertices)
-    rows = [f"f {a + 1}/1 {b + 1}/2 {c + 1}/3\n" for a, b, c in can.faces]
-    rows.insert(len(rows) // 2, "usemtl chrome\n")
-    library = "newmtl steel\nKd 0.6 0.6 0.6\nnewmtl chrome\nKd 0.61 0.6 0.6\n"
-    write("two.mtl", library)
-    text = f"mtllib two.mtl\n{points}{UV}usemtl steel\n{''.join(rows)}"
-    mesh = cr.load_mesh(write("can.obj", text), unit="mm")
-    assert not mesh.has_colours
-    assert len(mesh_symmetries(mesh)) == 72
 
 
 def test_options_of_the_command_line_reach_the_reader(tmp_path):

@@ -13,7 +13,7 @@ from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import CurviregWarning
-from curvireg_torch.formats.meshes.colours import colours_of_parts, texture_pixels
+from curvireg_torch.formats.meshes.colours import SurfaceColours, colours_of_parts, texture_pixels
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, colour_bytes
 from curvireg_torch.utils.extras import is_installed
 from tests._support.tables import text_table
@@ -308,18 +308,6 @@ def test_helpers_and_holes_are_no_surface(tmp_path, load):
 
 
 @needs_usd
-def test_a_part_of_usd_lies_in_the_frame_of_its_parent(write, load):
-    inner = square(
-        "double3 xformOp:translate = (5, 0, 0)\n"
-        '        uniform token[] xformOpOrder = ["xformOp:translate"]'
-    )
-    place = "    double3 xformOp:rotateXYZ = (0, 0, 90)\n"
-    place += '    uniform token[] xformOpOrder = ["xformOp:rotateXYZ"]\n'
-    mesh, _ = load(write("a.usda", stage(inner, place=place)))
-    assert_allclose(mesh.bounds, [[-1, 5, 0], [0, 7, 0]], atol=1e-6)
-
-
-@needs_usd
 def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path, write, load):
     write_print(tmp_path, painted((255, 0, 0)))
     colour = 'color3f[] primvars:displayColor = [(0, 1, 0)] (interpolation = "constant")\n        '
@@ -333,17 +321,17 @@ def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path, write, load):
 
 
 def test_a_mirrored_part_keeps_its_outside_and_its_colours():
-    triangle = trimesh.Trimesh(TRIANGLE, [[0, 1, 2]], vertex_colors=[RED, GREEN, BLUE])
-    (colours,) = colours_of_parts([triangle])
+    colours = SurfaceColours.plain(1)
+    colours.corners[0] = [RED, GREEN, BLUE]
     colours.uv[0] = [[0, 0], [1, 0], [0, 1]]
     mesh = ReadMesh(np.array(TRIANGLE), np.array([[0, 1, 2]]), colours, "mm", "y")
-    for signs, corners in (((-1, 1, 1), [BLUE, GREEN, RED]), ((-1, -1, 1), [RED, GREEN, BLUE])):
+    for signs, order in (((-1, 1, 1), [2, 1, 0]), ((-1, -1, 1), [0, 1, 2])):
         moved = mesh.transformed(np.diag([*signs, 1.0]))
-        assert moved.colours.corners[0].tolist() == corners
-        order = [corners.index(colour) for colour in (RED, GREEN, BLUE)]
-        assert moved.colours.uv[0, order].tolist() == [[0, 0], [1, 0], [0, 1]]
-        normal = np.cross(*(moved.vertices[moved.faces[0, 1:]] - moved.vertices[moved.faces[0, 0]]))
-        assert normal[2] > 0
+        assert moved.vertices.tolist() == (mesh.vertices * signs).tolist()
+        assert moved.faces.tolist() == [order]
+        for name in ("corners", "uv"):
+            found = getattr(moved.colours, name)[0]
+            np.testing.assert_array_equal(found, getattr(colours, name)[0, order])
         assert (moved.unit, moved.up) == ("mm", "y")
 
 
@@ -373,22 +361,9 @@ def test_colours_are_fractions_or_bytes(values, expected):
     assert colour_bytes(np.array(values)).tolist() == expected
 
 
-@pytest.mark.parametrize("suffix", ["obj", "ply"])
-def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(write, suffix):
-    shades = ["1.0024 0.2 0", "0 0.2 0", "1 0.2 0"]
-    if suffix == "obj":
-        points = [
-            f"v {x} {y} {z} {shade}\n" for (x, y, z), shade in zip(TRIANGLE, shades, strict=True)
-        ]
-        text = "".join(points) + "v 5 5 5\nf 1 2 3\nf 4 1 2\n"
-    else:
-        text = (
-            header(RGB.replace("uchar", "float"), "")
-            + rows([*shades, "1 1 1"])
-            + "3 0 1 2\n3 3 0 1\n"
-        )
-    mesh = cr.load_mesh(write(f"a.{suffix}", text))
-    assert mesh.has_colours
+def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(write):
+    text = "v 0 0 0 1.0024 0.2 0\nv 1 0 0 0 0.2 0\nv 0 1 0 1 0.2 0\nv 5 5 5\nf 1 2 3\nf 4 1 2\n"
+    mesh = cr.load_mesh(write("a.obj", text))
     assert first_corners(mesh) == [[255, 51, 0], WHITE]
 
 

@@ -101,10 +101,12 @@ def test_places_units_axes_and_polygons(tmp_path, load):
         "    double3 xformOp:translate = (10, 0, 5)\n    double3 xformOp:rotateXYZ = (90, 0, 0)\n"
     )
     place += '    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]\n'
-    path.write_text(stage(square(), place=place))
+    inner = "double3 xformOp:translate = (0, 0, 7)\n"
+    inner += '        uniform token[] xformOpOrder = ["xformOp:translate"]'
+    path.write_text(stage(square(inner), place=place))
     mesh, texts = load(path)
     assert (mesh.unit, mesh.up, texts) == ("mm", "z", [])
-    assert_allclose(mesh.bounds, [[10, 0, 5], [12, 0, 6]], atol=1e-6)
+    assert_allclose(mesh.bounds, [[10, -7, 5], [12, -7, 6]], atol=1e-6)
     assert_allclose(mesh.surface.face_normals, [[0, -1, 0]] * 2, atol=1e-6)
     assert not mesh.has_colours
     path.write_text(stage(square('uniform token orientation = "leftHanded"'), place=place))
@@ -149,11 +151,9 @@ def test_textures_by_the_coordinates_that_they_name(tmp_path, load, kind):
         package(path, text, textures__print_png=RED_ON_BLUE)
     mesh, texts = load(path)
     assert not texts
-    found = mesh.colours
-    assert found is not None
     near = np.array([0.8, 0.1], np.float32)
     lower = colours_at(
-        found, np.array([0], np.int32), near[:1], near[1:]
+        mesh.colours, np.array([0], np.int32), near[:1], near[1:]
     )  # beside (2, 0), the bottom
     assert lower[0].round().tolist() == [0, 0, 1]
     if kind == "usda":
