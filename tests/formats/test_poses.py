@@ -1,7 +1,5 @@
 """Poses as other tools write them."""
 
-import json
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -25,12 +23,12 @@ def check(found, unit=None, confidence=None, expected=T):
 
 
 @pytest.fixture
-def read(tmp_path):
+def read(write):
     """Write a file of poses, and read the one of a name, or the only one."""
 
     def written_and_read(content, name="", **options):
-        (tmp_path / "pose.json").write_text(json.dumps(content))
-        return read_pose(tmp_path / f"pose.json{name and ':'}{name}", **options)
+        path = write("pose.json", content)
+        return read_pose(f"{path}{name and ':'}{name}", **options)
 
     return written_and_read
 
@@ -135,13 +133,7 @@ def test_a_missing_file_is_named(tmp_path):
         read_pose(tmp_path / "lost.json:3")
 
 
-@pytest.mark.parametrize(
-    "keys",
-    [
-        {"schema": 3, "views": 9, "top": [{"rotation": np.eye(3).tolist()}], "none": 0.1},
-        {"schema": 4, "frame": "camera", "bank_views": 9, "hypotheses": [{"rotation": 1}]},
-    ],
-    ids=["schema 3", "schema 4"],
-)
-def test_results_of_both_schemas_are_start_poses(read, keys):
-    check(read({**keys, **MINE, "confidence": 0.8}), confidence=0.8)
+def test_results_are_start_poses_with_a_confidence(read):
+    of_others = {"rotation": np.eye(3).tolist()}
+    more = {"schema": 4, "frame": "camera", "top": [of_others], "hypotheses": [of_others]}
+    check(read({**more, **MINE, "confidence": 0.8}), confidence=0.8)
