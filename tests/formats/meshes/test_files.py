@@ -7,6 +7,7 @@ from curvireg_torch.mesh import load_mesh
 from tests._support.refusals import refused
 from tests.formats.meshes.pictures import encoded, noise
 from tests.formats.meshes.test_gltf import textured
+from tests.formats.meshes.test_ply import UV, header
 
 EXPECTED = {suffix: {f"part.{suffix}"} for suffix in ("gltf", "obj", "ply", "glb", "stl", "off")}
 EXPECTED["gltf"] |= {"picture.png", "points.bin"}
@@ -30,10 +31,8 @@ def write(folder, suffix):
         points = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
         path.write_text(f"mtllib part.mtl\n{points}usemtl skin\nf 1/1 2/2 3/3\n")
     elif suffix == "ply":
-        header = "ply\nformat ascii 1.0\ncomment TextureFile picture.png\nelement vertex 3\n"
-        header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "s", "t"))
-        header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-        path.write_text(header + "0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n")
+        text = header(UV, points=3, count=1, comments="comment TextureFile picture.png\n")
+        path.write_text(text + "0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n")
     else:
         trimesh.creation.box().export(path)
     return path

@@ -16,6 +16,7 @@ from curvireg_torch.formats.meshes import limits, polygons, source
 from curvireg_torch.mesh import mesh as mesh_module
 from tests._support.tables import text_table
 from tests.formats.meshes.test_gltf import TRIANGLE, Tree
+from tests.formats.meshes.test_ply import header, rows
 
 POINTS = np.array(TRIANGLE, "<f4").tobytes()
 
@@ -37,7 +38,7 @@ def glb(content):
 
 
 def refused(path, content, match, *, seconds=5.0, megabytes=100.0):
-    path.write_bytes(content)
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
     tracemalloc.start()
     start = time.process_time()
     with pytest.raises(MeshError, match=match) as caught:
@@ -101,7 +102,7 @@ WHOLE_ACCESSOR = tree()["accessors"][0]
     ],
 )
 def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path, changes, match):
-    refused(tmp_path / "a.gltf", json.dumps(tree(**changes)).encode(), match)
+    refused(tmp_path / "a.gltf", json.dumps(tree(**changes)), match)
     if "buffers" not in changes:
         refused(tmp_path / "a.glb", glb(tree(**changes)), match)
 
@@ -125,14 +126,11 @@ def test_load_mesh_opens_no_file_outside_the_folder(tmp_path, write, uri):
     (tmp_path / "other" / "b.bin").write_bytes(POINTS)
     (folder / "Linked").symlink_to(tmp_path / "other", target_is_directory=True)
     content = tree(buffers=[{"byteLength": 36, "uri": uri}])
-    refused(folder / "a.gltf", json.dumps(content).encode(), "no file of its folder")
+    refused(folder / "a.gltf", json.dumps(content), "no file of its folder")
 
 
-AXES = b"".join(b"property float %c\n" % axis for axis in b"xyz")
-PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000\n"
-PLY += b"property list uchar int vertex_indices\nend_header\n"
-
-QUAD = (PLY % (b"ascii", 4)).replace(b"9000000", b"1") + b"0 0 0\n1 0 0\n1 1 0\n0 1 0\n"
+QUAD = header(count=1) + rows([""] * 4)
+BINARY = header(points=10**9, count=9_000_000, kind="binary_little_endian")
 
 
 def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path, monkeypatch):
@@ -140,14 +138,14 @@ def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path, monkeypatc
         ("a.off", b"OFF\n1000000000 1000000000 0\n0 0 0\n", "too early"),
         ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
         ("a.off", b"OFF\n4 1 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2\n", "too early"),
-        ("a.ply", QUAD + b"4 0 1 2\n", "ends within its last row"),
+        ("a.ply", QUAD + "4 0 1 2\n", "ends within its last row"),
         (
             "a.ply",
-            QUAD.replace(b"vertex_indices", b"vertex_indices\nproperty float s") + b"4 0 1 2 3",
+            header(face="property float s\n", count=1) + rows([""] * 4) + "4 0 1 2 3",
             "ends within its last row",
         ),
-        ("a.ply", PLY % (b"binary_little_endian", 10**9) + b"\0\0", "early"),
-        ("a.ply", PLY % (b"ascii", 1) + b"0 0 0\n3 0 0 0\n", "ends before the last face"),
+        ("a.ply", BINARY + "\0\0", "early"),
+        ("a.ply", header(points=1) + "0 0 0\n3 0 0 0\n", "ends before the last face"),
         ("a.stl", b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50, "it was cut while"),
         ("a.gltf", b'{"asset": ' + b"[" * 1_000_000, "RecursionError"),
         ("a.obj", b"v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", r"1e\+12"),
@@ -163,7 +161,7 @@ def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path, monkeypatc
     content = (tmp_path / "a.stl").read_bytes()
     monkeypatch.setattr(mesh_module, "MAX_MESH_FACES", 1000)
     refused(tmp_path / "a.stl", content, "1,280 faces")
-    copies = json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode()
+    copies = json.dumps(tree(nodes=[{"mesh": 0}] * 200))
     monkeypatch.setattr(limits, "MAX_MESH_FACES", 100)
     refused(tmp_path / "a.gltf", copies, "more than 100 faces")
     monkeypatch.setattr(source, "MAX_MESH_BYTES", 1000)
@@ -192,10 +190,13 @@ def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path, write):
 
 
 def test_faces_are_counted_before_they_are_divided(tmp_path, write, monkeypatch):
-    dart = b"OFF\n4 %d 0\n0 0 0\n1 2 0\n0 1 0\n-1 2 0\n" + b"4 0 1 2 3\n" * 10
-    ply = PLY.replace(b"9000000", b"10") % (b"ascii", 4) + dart.split(b"\n", 2)[2]
-    obj = b"v 0 0 0\nv 1 2 0\nv 0 1 0\nv -1 2 0\n" + b"f 1 2 3 4\n" * 10
-    for name, content in (("a.off", dart % 10), ("a.ply", ply), ("a.obj", obj)):
+    dart = "0 0 0\n1 2 0\n0 1 0\n-1 2 0\n" + "4 0 1 2 3\n" * 10
+    obj = "v 0 0 0\nv 1 2 0\nv 0 1 0\nv -1 2 0\n" + "f 1 2 3 4\n" * 10
+    for name, content in (
+        ("a.off", f"OFF\n4 10 0\n{dart}"),
+        ("a.ply", header(count=10) + dart),
+        ("a.obj", obj),
+    ):
         monkeypatch.undo()
         write(name, content)
         assert len(cr.load_mesh(tmp_path / name).faces) == 20

@@ -34,47 +34,37 @@ def picture(path):
     return pixels
 
 
-def write(folder, library, name="a.mtl"):
+def write(folder, library):
     """A box that is textured by material ``label``."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / name).write_text(library)
+    (folder / "a.mtl").write_text(library)
     path = folder / "box.obj"
-    path.write_text(f"mtllib {name}\n{POINTS}{UV}usemtl label\n{textured(''.join(HALVES))}")
+    path.write_text(f"mtllib a.mtl\n{POINTS}{UV}usemtl label\n{textured(''.join(HALVES))}")
     return path
 
 
-@pytest.mark.parametrize(
-    "encoding", ["utf-8-sig", "utf-16", "utf-16-le-mark", "latin-1", "gbk", "cr", "crlf"]
-)
-@pytest.mark.parametrize("first", ["v", "mtllib", "comment", "o"])
-def test_every_encoding_gives_the_same_mesh(write, encoding, first):
+ENCODINGS = [(name, "\n") for name in ("utf-8-sig", "utf-16", "latin-1", "gbk")]
+ENCODINGS += [("utf-8", "\r"), ("utf-8", "\r\n")]
+
+
+@pytest.mark.parametrize(("encoding", "end"), ENCODINGS)
+@pytest.mark.parametrize("first", ["", "mtllib m.mtl\n", "# {}\n", "o {}\n"])
+def test_every_encoding_gives_the_same_mesh(write, encoding, end, first):
     name = {"latin-1": "Gehäuse", "gbk": "外壳"}.get(encoding, "part")
-    starts = {"v": "", "mtllib": "mtllib m.mtl\n", "comment": f"# {name}\n", "o": f"o {name}\n"}
-    text = starts[first] + BOX
     write("m.mtl", "newmtl a\nKd 0.8 0.1 0.1\n")
-    if encoding == "utf-16-le-mark":
-        data = b"\xff\xfe" + text.encode("utf-16-le")
-    elif encoding in ("cr", "crlf"):
-        data = text.replace("\n", "\r" if encoding == "cr" else "\r\n").encode()
-    else:
-        data = text.encode(encoding)
-    mesh = cr.load_mesh(write("a.obj", data))
+    text = (first.format(name) + BOX).replace("\n", end)
+    mesh = cr.load_mesh(write("a.obj", text.encode(encoding)))
     assert (len(mesh.faces), mesh.extents.tolist()) == (12, [3.0, 2.0, 1.0])
 
 
-def test_materials_of_all_libraries_and_none_without_a_name(write, load):
+def test_names_of_libraries_may_hold_blanks_and_lost_materials_are_named(write, load):
     write("a.mtl", "newmtl red\nKd 1 0 0\n")
     write("b c.mtl", "newmtl blue\nKd 0 0 1\n")
-    write("b.mtl", "newmtl blue\nKd 0 0 1\n")
     body = f"{POINTS}usemtl red\n{HALVES[0]}usemtl blue\n{HALVES[1]}"
-    for names in ("a.mtl\nmtllib b.mtl", "a.mtl b.mtl", "a.mtl\nmtllib b c.mtl"):
-        colours = cr.load_mesh(write("a.obj", f"mtllib {names}\n{body}")).colours
-        assert (colours.corners[:6] == [255, 0, 0]).all()
-        assert (colours.corners[6:] == [0, 0, 255]).all()
-    assert "lack the material blue" in load(write("a.obj", "mtllib a.mtl\n" + body))[1][0]
-    nameless = body.replace("usemtl blue", "usemtl")
-    colours = load(write("a.obj", "mtllib a.mtl\n" + nameless))[0].colours
-    assert (colours.corners[6:] == 255).all(), "no name: no material"
+    colours = cr.load_mesh(write("a.obj", f"mtllib a.mtl\nmtllib b c.mtl\n{body}")).colours
+    assert (colours.corners[:6] == [255, 0, 0]).all()
+    assert (colours.corners[6:] == [0, 0, 255]).all()
+    assert "lack the material blue" in load(write("a.obj", f"mtllib a.mtl\n{body}"))[1][0]
 
 
 def test_faces_of_a_textured_material_without_coordinates_are_named(write, load, tmp_path):
@@ -129,8 +119,7 @@ def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_i
     tmp_path, load
 ):
     picture(tmp_path / "images" / "label.png")
-    outside = str(tmp_path / "images" / "label.png")
-    for name in ("../images/label.png", outside, "C:\\art\\label.png"):
+    for name in (tmp_path / "images" / "label.png", "C:\\art\\label.png"):
         path = write(tmp_path / "models", f"newmtl label\nmap_Kd {name}\n")
         mesh, (text,) = load(path)
         assert not mesh.has_colours
@@ -139,11 +128,9 @@ def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_i
         mesh = cr.load_mesh(path, textures=tmp_path / "images")
         assert mesh.has_colours
     path = write(tmp_path / "models", "newmtl label\nmap_Kd ../images/label.png\n")
-    assert "lies outside of its folder" in load(path)[1][0]
     assert load(path, textures=tmp_path)[0].has_colours
     path.write_text(path.read_text().replace("mtllib a.mtl", "mtllib ../a.mtl"))
     (path.parent / "a.mtl").rename(tmp_path / "a.mtl")
-    assert "../a.mtl lies outside of its folder" in load(path)[1][0]
     assert load(path, textures=tmp_path)[0].has_colours
 
 

@@ -20,7 +20,7 @@ from tests._support.tables import text_table
 from tests.formats.meshes.packages import mesh_of_robot, model, robot, solid, threemf
 from tests.formats.meshes.pictures import painted
 from tests.formats.meshes.test_gltf import TRIANGLE, Tree, coordinates, skinned, textured
-from tests.formats.meshes.test_ply import FACES, RGB, header, rows
+from tests.formats.meshes.test_ply import FACES, RGB, UV, header, rows
 from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, square, stage, write_print
 
 needs_usd = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
@@ -147,7 +147,7 @@ def test_parts_keep_their_own_colours_and_textures(loaded):
     for material in (1, 2, None):
         part = tree.part(None, TRIANGLE, **({} if material is None else {"material": material}))
         part["attributes"]["TEXCOORD_0"] = 1
-    tree.array(np.frombuffer(painted((0, 255, 0)), np.uint8), "B")
+    tree.array(np.frombuffer(painted(GREEN), np.uint8), "B")
     tree.content["images"] += [{"bufferView": len(tree.content["bufferViews"]) - 1}]
     mesh = loaded(tree)
     assert mesh.colours.texture.tolist() == [0, -1, 1, -1]
@@ -158,7 +158,7 @@ def test_parts_keep_their_own_colours_and_textures(loaded):
 def test_a_picture_as_webp_wins(write, loaded):
     tree = textured({})
     tree.content["images"] += [{"uri": "b.png"}]
-    write("b.png", painted((0, 255, 0)))
+    write("b.png", painted(GREEN))
     tree.content["textures"] = [{"source": 0, "extensions": {"EXT_texture_webp": {"source": 1}}}]
     assert textures(loaded(tree)) == [GREEN]
 
@@ -166,37 +166,29 @@ def test_a_picture_as_webp_wins(write, loaded):
 # OBJ
 
 
-def obj(folder, libraries, more=""):
-    for name, text in libraries.items():
-        (folder / name).write_text(text)
-    path = folder / "a.obj"
-    names = "".join(f"mtllib {name}\n" for name in libraries)
-    path.write_text(f"{names}v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n{more}")
-    return path
+POINTS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\n"
 
 
-def test_of_two_materials_of_a_name_the_first_counts(tmp_path):
-    red = "newmtl m\nKd 1 0 0\n"
-    blue = "newmtl m\nKd 0 0 1\n"
-    assert first_corners(cr.load_mesh(obj(tmp_path, {"a.mtl": red, "b.mtl": blue}))) == [RED]
-    assert first_corners(cr.load_mesh(obj(tmp_path, {"b.mtl": blue, "a.mtl": red}))) == [BLUE]
+def test_of_two_materials_of_a_name_the_first_counts(write):
+    write("red.mtl", "newmtl m\nKd 1 0 0\n")
+    write("blue.mtl", "newmtl m\nKd 0 0 1\n")
+    for names, colour in (("red.mtl blue.mtl", RED), ("blue.mtl red.mtl", BLUE)):
+        mesh = cr.load_mesh(write("a.obj", f"mtllib {names}\n{POINTS}f 1 2 3\n"))
+        assert first_corners(mesh) == [colour]
 
 
-def test_colours_of_vertices_win_over_those_of_materials(tmp_path):
-    path = obj(tmp_path, {"a.mtl": "newmtl m\nKd 1 0 0\n"})
-    text = path.read_text()
-    for line in ("v 0 0 0", "v 1 0 0", "v 0 1 0"):
-        text = text.replace(line, f"{line} 0 1 0")
-    path.write_text(text)
-    assert first_corners(cr.load_mesh(path)) == [GREEN]
+def test_colours_of_vertices_win_over_those_of_materials(write):
+    write("a.mtl", "newmtl m\nKd 1 0 0\n")
+    points = POINTS.replace(" 0\n", " 0 0 1 0\n")
+    mesh = cr.load_mesh(write("a.obj", f"mtllib a.mtl\n{points}f 1 2 3\n"))
+    assert first_corners(mesh) == [GREEN]
 
 
-def test_a_face_has_a_texture_if_all_its_corners_have_coordinates(tmp_path, write, load):
-    write("a.png", painted((0, 255, 0)))
-    path = obj(tmp_path, {"a.mtl": "newmtl m\nKd 1 0 0\nmap_Kd a.png\n"}, "vt 0 0\nvt 1 1\n")
-    text = path.read_text().replace("f 1 2 3\n", "")
-    path.write_text(f"{text}f 1/1 2/2 3/2\nf 1/1 2/2 3\nf 1 2 3\n")
-    mesh, (said,) = load(path)
+def test_a_face_has_a_texture_if_all_its_corners_have_coordinates(write, load):
+    write("a.png", painted(GREEN))
+    write("a.mtl", "newmtl m\nKd 1 0 0\nmap_Kd a.png\n")
+    faces = "vt 0 0\nvt 1 1\nf 1/1 2/2 3/2\nf 1/1 2/2 3\nf 1 2 3\n"
+    mesh, (said,) = load(write("a.obj", f"mtllib a.mtl\n{POINTS}{faces}"))
     assert "lack texture coordinates; they are shown in its plain colour" in said
     assert textures(mesh) == [GREEN, WHITE, WHITE]
     assert first_corners(mesh) == [WHITE, RED, RED]
@@ -210,22 +202,15 @@ def test_weights_of_vertices_divide(write):
 
 # PLY
 
-UV = "property float s\nproperty float t\n"
 TEXTURES = "".join(f"comment TextureFile {name}.png\n" for name in ("red", "green"))
 
 
-@pytest.fixture
-def pictures(tmp_path):
+def test_the_texture_of_a_polygon_is_that_of_its_triangles(write):
     for name, colour in (("red", RED), ("green", GREEN)):
-        (tmp_path / f"{name}.png").write_bytes(painted((colour[0], colour[1], colour[2])))
-    return tmp_path
-
-
-def test_the_texture_of_a_polygon_is_that_of_its_triangles(pictures):
+        write(f"{name}.png", painted(colour))
     text = header(UV, "property int texnumber\n", count=4, comments=TEXTURES)
     faces = "4 0 1 2 3 1\n3 0 1 2 0\n3 0 1 3 -1\n3 0 2 3 -2\n"
-    (pictures / "a.ply").write_text(text + rows(["0 0"] * 4) + faces)
-    mesh = cr.load_mesh(pictures / "a.ply")
+    mesh = cr.load_mesh(write("a.ply", text + rows(["0 0"] * 4) + faces))
     assert textures(mesh) == [GREEN, GREEN, RED, WHITE, WHITE]
 
 
@@ -285,7 +270,7 @@ def test_a_colour_of_a_visual_wins_over_a_named_one(tmp_path, load):
 
 
 def test_colours_of_a_mesh_win_over_those_of_the_urdf(tmp_path, write, load):
-    write("a.ply", header(RGB, "") + rows(["0 255 0"] * 4) + FACES)
+    write("a.ply", header(RGB) + rows(["0 255 0"] * 4) + FACES)
     own = '<material name="m"><color rgba="0 0 1 1"/></material>'
     path = robot(tmp_path / "a.urdf", mesh_of_robot("a.ply") + own)
     assert first_corners(load(path)[0]) == [GREEN, GREEN]
@@ -309,7 +294,7 @@ def test_helpers_and_holes_are_no_surface(tmp_path, load):
 
 @needs_usd
 def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path, write, load):
-    write_print(tmp_path, painted((255, 0, 0)))
+    write_print(tmp_path, painted(RED))
     colour = 'color3f[] primvars:displayColor = [(0, 1, 0)] (interpolation = "constant")\n        '
     plain = square(colour).replace('"square"', '"plain"')
     mesh, _ = load(write("a.usda", stage(MATERIAL, square(colour + MAP, BOUND), plain)))

@@ -11,7 +11,8 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes.polygons import triangulated
 from tests._support.refusals import refused
-from tests.formats.meshes.test_ply import RGB
+from tests.formats.meshes.test_obj import POINTS
+from tests.formats.meshes.test_ply import RGB, header
 
 CONVEX = np.array([[0, 0], [3, 0], [4, 2], [2, 4], [0, 2]], dtype=float)
 DART = np.array([[0, 0], [1, 2], [0, 1], [-1, 2]], dtype=float)
@@ -69,10 +70,8 @@ def write(path, kind):
     lists = "".join(f"{len(f)} {' '.join(map(str, f))}\n" for f in faces)
     if kind.endswith("with colours"):
         lists = "".join(f"{line} 255 0 0\n" for line in lists.splitlines())
-    if kind == "off":
+    if kind.startswith("off"):
         path.write_text(f"OFF # a U\n16 10 0\n\n{points}{lists}")
-    elif kind == "off with colours":
-        path.write_text(f"OFF\n16 10 0\n{points}{lists}")
     elif kind.startswith("obj"):
         first = -16 if kind == "obj counted back" else 1
         corner = "{0}/{0}/{0}" if kind == "obj with texture" else "{0}"
@@ -85,10 +84,7 @@ def write(path, kind):
         path.write_text(text + uv + "\n".join(lines) + "\n")
     else:
         colour = RGB if kind == "ply with colours" else ""
-        header = "ply\nformat ascii 1.0\ncomment a U\nelement vertex 16\n"
-        header += "".join(f"property float {axis}\n" for axis in "xyz") + "element face 10\n"
-        header += f"property list uchar int vertex_indices\n{colour}end_header\n"
-        path.write_text(header + points + lists)
+        path.write_text(header(face=colour, points=16, count=10) + points + lists)
 
 
 KINDS = ["off", "off with colours", "obj", "obj counted back", "obj continued", "obj with texture"]
@@ -120,12 +116,11 @@ def test_divided_faces_of_an_obj_keep_texture_coordinates_at_their_corners(tmp_p
 
 
 def binary_ply(faces, vertices):
-    header = f"ply\nformat binary_big_endian 1.0\nelement vertex {len(vertices)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz") + f"element face {len(faces)}\n"
+    head = header(points=len(vertices), count=len(faces), kind="binary_big_endian").encode()
     body = vertices.astype(">f4").tobytes() + b"".join(
         struct.pack(f">B{len(f)}i", len(f), *f) for f in faces
     )
-    return f"{header}property list uchar int vertex_indices\nend_header\n".encode() + body
+    return head + body
 
 
 def test_load_mesh_reads_binary_ply_of_one_number_of_corners(write):
@@ -141,24 +136,15 @@ def test_load_mesh_reads_binary_ply_of_one_number_of_corners(write):
         cr.load_mesh(path)
 
 
-BOX = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
-SIDES = [[1, 2, 4, 3], [5, 7, 8, 6], [1, 5, 6, 2], [3, 4, 8, 7], [1, 3, 7, 5], [2, 6, 8, 4]]
+SIDES = ["1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4"]
 
 
 @pytest.mark.parametrize("line", ["f {}", "  f {}", "\tf {}", "f {} # side", "f\t{}"])
-@pytest.mark.parametrize("triangles", [True, False])
-def test_load_mesh_reads_every_face_of_an_obj(write, line, triangles):
+def test_load_mesh_reads_every_face_of_an_obj(write, line):
     """trimesh drops indented faces and refuses comments behind them."""
-    faces = [
-        f for a, b, c, d in SIDES for f in ([[a, b, c], [a, c, d]] if triangles else [[a, b, c, d]])
-    ]
-    rows = [
-        f"f {' '.join(map(str, f))}" if k % 2 else line.format(" ".join(map(str, f)))
-        for k, f in enumerate(faces)
-    ]
-    path = write("box.obj", BOX + "\n".join(rows) + "\n")
-    mesh = cr.load_mesh(path)
-    assert (len(mesh.faces), abs(mesh.surface.volume)) == (12, pytest.approx(1.0))
+    rows = [(line if k % 2 else "f {}").format(side) for k, side in enumerate(SIDES)]
+    mesh = cr.load_mesh(write("box.obj", POINTS + "\n".join(rows)))
+    assert (len(mesh.faces), abs(mesh.surface.volume)) == (12, pytest.approx(6.0))
 
 
 @pytest.mark.parametrize("kind", ["off", "obj", "ply"])

@@ -14,7 +14,6 @@ from curvireg_torch.mesh import as_mesh
 from tests._support.quick import slow_after
 from tests.formats.meshes.pictures import encoded, noise
 from tests.formats.meshes.test_files import write as write_mesh
-from tests.formats.meshes.test_obj import write as write_obj
 
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n"
 FORMATS = dict.fromkeys(("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM"), True)
@@ -59,15 +58,12 @@ def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path, write):
             assert as_mesh(mesh).colours is None
 
 
-def test_pixels_of_all_textures_together_are_bounded(tmp_path, write, load, monkeypatch):
-    content = picture("PNG", (40, 25))
-    path = write_obj(tmp_path, "".join(f"newmtl m{k}\nmap_Kd {k}.png\n" for k in range(4)))
+def test_pixels_of_all_textures_together_are_bounded(write, load, monkeypatch):
     for k in range(4):
-        write(f"{k}.png", content)
-    head, _, faces = path.read_text().partition("usemtl label\n")
-    rows = faces.splitlines(keepends=True)
-    parts = [f"usemtl m{k}\n" + "".join(rows[3 * k : 3 * k + 3]) for k in range(4)]
-    path.write_text(head + "".join(parts))
+        write(f"{k}.png", picture("PNG", (40, 25)))
+    write("a.mtl", "".join(f"newmtl m{k}\nmap_Kd {k}.png\n" for k in range(4)))
+    faces = "".join(f"usemtl m{k}\nf 1/1 2/1 3/1\n" for k in range(4))
+    path = write("a.obj", f"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\n{faces}")
     monkeypatch.setattr(source, "MAX_TEXTURE_PIXELS", 3999)
     monkeypatch.setattr(colours, "MAX_TEXTURE_PIXELS", 3999)
     mesh, texts = load(path)

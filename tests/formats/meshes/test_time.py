@@ -8,7 +8,7 @@ from tests._support.refusals import refused
 from tests.formats.meshes.test_obj import BOX
 from tests.formats.meshes.test_ply import FACES, header, rows
 
-PLY, PLY_END = (header("", "", comments="HERE") + rows([""] * 4) + FACES).split("HERE")
+PLY, PLY_END = (header(comments="HERE") + rows([""] * 4) + FACES).split("HERE")
 HOSTILE = {
     "obj blanks": (f"{BOX}f", " " * 20, "\n"),
     "obj blanks behind": (f"{BOX}f 1 2 3", " " * 20, "x\n"),
