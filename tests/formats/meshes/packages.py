@@ -27,11 +27,11 @@ def threemf(path, *content, more=None, **how):
     return path
 
 
-def solid(number, attributes="", triangle=""):
-    vertices = "".join('<vertex x="{:g}" y="{:g}" z="{:g}"/>'.format(*v) for v in BOX.vertices)
+def solid(number, attributes="", triangle="", shape=BOX):
+    vertices = "".join('<vertex x="{:g}" y="{:g}" z="{:g}"/>'.format(*v) for v in shape.vertices)
     faces = "".join(
         f'<triangle v1="{a}" v2="{b}" v3="{c}" {triangle if k < 6 else ""}/>'
-        for k, (a, b, c) in enumerate(BOX.faces)
+        for k, (a, b, c) in enumerate(shape.faces)
     )
     mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
     return f'<object id="{number}" type="model" {attributes}>{mesh}</object>'

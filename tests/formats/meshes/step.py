@@ -20,6 +20,11 @@ def step_file(size, unit):
     return text
 
 
+def global_section(text):
+    """The lines of an IGES file with its global parameters."""
+    return [f"{text[k : k + 72]:<72}G{k // 72 + 1:7d}" for k in range(0, len(text), 72)]
+
+
 def iges_file(size, flag, name):
     """The text of a rectangle at the origin: a ruled surface between two lines. ``flag`` is that of
     the unit."""
@@ -31,8 +36,8 @@ def iges_file(size, flag, name):
     forms = [0, 0, 1]
     whole = "1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,4Hpart,1.,"
     whole += f"{flag},{len(name)}H{name},1,0.01,15H20260101.000000,1E-6,10.,1Ha,1Hb,11,0,15H20260101.000000;"  # noqa: E501
-    head = [whole[k : k + 72] for k in range(0, len(whole), 72)]
-    lines = [f"{'part':<72}S{1:7d}", *(f"{text:<72}G{k + 1:7d}" for k, text in enumerate(head))]
+    head = global_section(whole)
+    lines = [f"{'part':<72}S{1:7d}", *head]
     for k, text in enumerate(parameters):
         kind = int(text.partition(",")[0])
         first = (kind, k + 1, 0, 0, 0, 0, 0, 0, "00000000")

@@ -18,7 +18,7 @@ from curvireg_torch.utils.extras import is_installed
 from curvireg_torch.utils.programs import run_program
 from tests._support.refusals import refused
 from tests._support.spies import spied
-from tests.formats.meshes.packages import mesh_of_robot, robot
+from tests.formats.meshes.packages import mesh_of_robot, robot, solid
 from tests.formats.meshes.packages import threemf as write_package
 from tests.formats.meshes.pictures import painted
 from tests.formats.meshes.step import step_file
@@ -82,9 +82,6 @@ def test_copies_of_a_part_do_not_hold_its_unused_vertices(tmp_path, suffix):
     mesh = with_unused_vertices()
     ply = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     ply.export(tmp_path / "a.ply")
-    vertices = "".join('<vertex x="{:g}" y="{:g}" z="{:g}"/>'.format(*v) for v in mesh.vertices)
-    faces = "".join('<triangle v1="{}" v2="{}" v3="{}"/>'.format(*face) for face in mesh.faces)
-    solid = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
     copy = '<component objectid="1" transform="1 0 0 0 1 0 0 0 1 0 0 {}"/>'
     peaks = []
     for copies in (4, 16):
@@ -93,7 +90,7 @@ def test_copies_of_a_part_do_not_hold_its_unused_vertices(tmp_path, suffix):
         else:
             all_copies = "".join(map(copy.format, range(copies)))
             whole = f'<object id="2"><components>{all_copies}</components></object>'
-            resources = f'<object id="1">{solid}</object>{whole}'
+            resources = solid(1, shape=mesh) + whole
             path = write_package(tmp_path / "a.3mf", resources, '<item objectid="2"/>')
         peaks.append(peak(path))
     assert peaks[1] - peaks[0] < UNUSED  # bytes: less than one for each vertex

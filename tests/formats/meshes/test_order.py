@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose
 from PIL import Image
 
 import curvireg_torch as cr
-from curvireg_torch.errors import CurviregWarning
 from curvireg_torch.formats.meshes.colours import SurfaceColours, colours_of_parts, texture_pixels
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, colour_bytes
 from curvireg_torch.utils.extras import is_installed
@@ -361,13 +360,6 @@ def test_a_folder_beside_the_mesh_wins_over_one_of_textures(tmp_path):
     (tmp_path / "mesh" / "a.png").unlink()
     assert source.read("a.png") == b"textures"
     assert source.read("somewhere/else/a.png") == b"textures"
-
-
-def test_no_unit_is_proposed_for_a_mesh_that_none_makes_plausible(tmp_path):
-    box = trimesh.creation.box((2e-3, 1e-3, 5e-4))
-    box.export(tmp_path / "b.stl")
-    with pytest.warns(CurviregWarning, match=r"give the unit$"):
-        cr.load_mesh(tmp_path / "b.stl")
 
 
 def test_names_do_not_lead_out_of_a_folder_of_textures(tmp_path, write):

@@ -2,7 +2,6 @@
 
 import zipfile
 
-import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
@@ -10,7 +9,6 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import usd
 from curvireg_torch.formats.meshes.files import mesh_files
-from curvireg_torch.mesh.colours import colours_at
 from curvireg_torch.utils import programs
 from curvireg_torch.utils.extras import is_installed
 from tests._support.refusals import refused
@@ -72,9 +70,6 @@ def stage(*parts, about='metersPerUnit = 0.001\n    upAxis = "Z"', place=""):
 
 def textures_of(mesh):
     return [texture[0, 0].tolist() for texture in mesh.colours.textures]
-
-
-RED_ON_BLUE = encoded([[[255, 0, 0]] * 8] * 4 + [[[0, 0, 255]] * 8] * 4)
 
 
 def write_print(folder, picture):
@@ -139,26 +134,18 @@ def test_colours_of_the_mesh(write, load):
     assert mesh.has_colours
 
 
-@pytest.mark.parametrize("kind", ["usda", "usdz"])
-def test_textures_by_the_coordinates_that_they_name(tmp_path, load, kind):
-    text = stage(MATERIAL, square(MAP, BOUND))
-    path = tmp_path / f"part.{kind}"
-    if kind == "usda":
-        path.write_text(text)
-        write_print(tmp_path, RED_ON_BLUE)
-        assert mesh_files(path) == [path, tmp_path / "textures" / "print.png"]
-    else:
-        package(path, text, textures__print_png=RED_ON_BLUE)
+def test_textures_by_the_coordinates_that_they_name(tmp_path, write, load):
+    write_print(tmp_path, encoded([[[255, 0, 0]], [[0, 0, 255]]]))
+    path = write("part.usda", stage(MATERIAL, square(MAP, BOUND)))
+    picture = tmp_path / "textures" / "print.png"
+    assert mesh_files(path) == [path, picture]
     mesh, texts = load(path)
+    colours = mesh.colours
     assert not texts
-    near = np.array([0.8, 0.1], np.float32)
-    lower = colours_at(
-        mesh.colours, np.array([0], np.int32), near[:1], near[1:]
-    )  # beside (2, 0), the bottom
-    assert lower[0].round().tolist() == [0, 0, 1]
-    if kind == "usda":
-        (tmp_path / "textures" / "print.png").unlink()
-        assert any("print.png is missing" in text for text in load(path)[1])
+    assert [texture[:, 0].tolist() for texture in colours.textures] == [[[255, 0, 0], [0, 0, 255]]]
+    assert colours.uv.tolist() == [[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]]
+    picture.unlink()
+    assert any("print.png is missing" in text for text in load(path)[1])
 
 
 def test_textures_lie_beside_the_file_that_names_them(tmp_path, write, load):
@@ -175,6 +162,7 @@ def test_textures_lie_beside_the_file_that_names_them(tmp_path, write, load):
     mesh, texts = load(path)
     assert textures_of(mesh) == []
     assert "blue/textures/print.png is missing" in texts[0]
+    text = text.replace(material, MATERIAL)
     packed = package(tmp_path / "p[1].usdz", text, textures__print_png=painted((0, 255, 0)))
     for place in (packed, path):
         path.write_text('#usda 1.0\ndef "a" (references = @p[1].usdz@)\n{\n}\n')
