@@ -1,7 +1,6 @@
 """Boxes as detectors and annotation tools write them."""
 
 import warnings
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +32,10 @@ def photo(tmp_path):
     return path
 
 
-def box_of(path, photo, size=SIZE, orientation=1):
-    """The box of a photograph that need not exist."""
-    return BoxFile(path).box(Path(photo), lambda: PictureSize(size, orientation))
+def box_of(boxes, photo, size=SIZE, orientation=1):
+    """The box in a file, which may be open, of a photograph that need not exist."""
+    boxes = boxes if isinstance(boxes, BoxFile) else BoxFile(boxes)
+    return boxes.box(Path(photo), lambda: PictureSize(size, orientation))
 
 
 def test_formats_of_four_numbers():
@@ -179,25 +179,23 @@ def test_annotations_of_coco_name_images_and_categories(write):
 def test_photographs_of_one_name_are_told_apart_by_their_folders(write):
     content = annotations(("set/cam1/000001.jpg", CORNER), ("set/cam2/000001.jpg", PIXELS))
     boxes = BoxFile(write("boxes.json", content))
-    of = partial(boxes.box, picture=lambda: PictureSize(SIZE))
-    assert of(Path("cam2/000001.jpg")) == BOX
-    assert of(Path("elsewhere/cam1/000001.jpg")) == OTHER
-    assert of(Path("/any/cam2/000001.png")) == BOX  # another ending
+    assert box_of(boxes, "cam2/000001.jpg") == BOX
+    assert box_of(boxes, "elsewhere/cam1/000001.jpg") == OTHER
+    assert box_of(boxes, "/any/cam2/000001.png") == BOX, "another ending"
     with refused("no box in"):
-        of(Path("cam3/000001.jpg"))
+        box_of(boxes, "cam3/000001.jpg")
 
 
 def test_the_folder_of_a_file_of_one_folder_need_not_be_that_of_the_photographs(write):
     content = annotations(("export/000001.jpg", CORNER), ("export/000002.jpg", PIXELS))
     boxes = BoxFile(write("boxes.json", content))
-    picture = partial(PictureSize, SIZE)
     with pytest.warns(CurviregWarning, match=r"boxes of export/000002.jpg are used for .*shots/0"):
-        assert boxes.box(Path("shots/000002.jpg"), picture) == BOX
+        assert box_of(boxes, "shots/000002.jpg") == BOX
     with refused(r"may be that of .*shots/000002.jpg, too"):
-        boxes.box(Path("other/000002.jpg"), picture)
+        box_of(boxes, "other/000002.jpg")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert boxes.box(Path("export/000002.jpg"), picture) == BOX
+        assert box_of(boxes, "export/000002.jpg") == BOX
 
 
 def test_two_images_that_may_be_the_photograph_are_refused(write):
@@ -270,10 +268,9 @@ def test_megapose_writes_corners_of_the_only_photograph(write, photo):
     assert box_of(file, photo) == BOX
     assert box_of(f"{file}:can", photo) == BOX
     boxes = BoxFile(file)
-    boxes.box(photo, partial(PictureSize, SIZE))
-    boxes.box(photo, partial(PictureSize, SIZE))
+    assert box_of(boxes, photo) == box_of(boxes, photo) == BOX
     with refused("may be that of"):
-        boxes.box(Path("second.png"), partial(PictureSize, SIZE))
+        box_of(boxes, "second.png")
     for frame in ("turn-000001", "turn-000002"):
         assert boxes.of_frame(frame, PictureSize(SIZE)) == BOX
 
@@ -332,15 +329,13 @@ def test_a_circle_of_labelme_is_a_centre_and_a_point_on_it(write):
 def test_folders_of_labels_have_the_folders_of_the_photographs(write):
     write("labels/cam1/a.txt", "0 0.5 0.5 0.5 0.5")
     boxes = BoxFile(write("labels/a.txt", "0 0.25 0.25 0.25 0.25").parent)
-    of = partial(boxes.box, picture=partial(PictureSize, SIZE))
-    assert of(Path("shots/cam1/a.jpg")) == BOX
-    below = of(Path("shots/cam2/a.jpg"))
-    assert below == pytest.approx((7.5, 5.5, 23.5, 17.5))
+    assert box_of(boxes, "shots/cam1/a.jpg") == BOX
+    assert box_of(boxes, "shots/cam2/a.jpg") == pytest.approx((7.5, 5.5, 23.5, 17.5))
     with refused(r"may be that of .*cam2/a.jpg, too; name their"):
-        of(Path("shots/cam3/a.jpg"))
+        box_of(boxes, "shots/cam3/a.jpg")
     write("labels/a.xml", VOC)
     with refused(r"a.txt and a.xml for one photograph; keep one"):
-        of(Path("shots/cam2/a.jpg"))
+        box_of(boxes, "shots/cam2/a.jpg")
 
 
 NO_BOXES = """
@@ -370,13 +365,12 @@ def test_a_missing_file_is_named(tmp_path):
 # ---- shared cases --------------------------------------------------------------------------------
 
 LAMP = (334.0, 146.0, 711.0, 573.5)
-VGA3 = PictureSize((720, 960))
 
 
 def test_files_of_annotation_tools():
     folder = real_case("n25-annotation-tools")
     for name in ("labelme.json", "voc.xml"):
-        found = BoxFile(folder / name).box(Path("photo.jpg"), lambda: VGA3)
+        found = box_of(folder / name, "photo.jpg", (720, 960))
         assert found == pytest.approx(LAMP, abs=0.6)
     for name, words in (("cvat.xml", "CVAT's own XML; export"), ("label_studio.json", "export")):
         with refused(words):

@@ -8,9 +8,7 @@ TEXTURE = np.arange(60, dtype=np.uint8).reshape(4, 5, 3) * 4
 
 def at(uv, corners=(255, 255, 255)):
     """The colour (0 to 255) of a face whose points all have the texture coordinates ``uv``."""
-    face = np.array([corners] * 3, np.uint8)[None]
-    coordinates = np.tile(np.array(uv, np.float32), (1, 3, 1))
-    colours = SurfaceColours(face, coordinates, np.zeros(1, np.int32), (TEXTURE,))
+    colours = SurfaceColours.plain(1, corners).with_texture([0], TEXTURE, [uv] * 3)
     third = np.full(1, 1.0 / 3.0, np.float32)
     return (255.0 * colours_at(colours, np.zeros(1, np.int32), third, third)[0]).tolist()
 

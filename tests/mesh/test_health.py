@@ -142,12 +142,10 @@ def test_a_texture_counts_if_a_word_of_it_differs(fraction):
     texture = np.full((side, side, 3), 200, np.uint8)
     width = round(side * fraction**0.5)
     texture[:width, :width, 1] = 90
-    mesh = trimesh.Trimesh(
-        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False
-    )
-    uv = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32)
-    corners = np.full((2, 3, 3), 255, np.uint8)
-    colours = SurfaceColours(corners, uv, np.zeros(2, np.int32), (texture,))
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    mesh = trimesh.Trimesh(square, faces, process=False)
+    colours = SurfaceColours.plain(2).with_texture([0, 1], texture, square[faces, :2])
     assert Mesh(mesh, colours=colours).has_colours == (fraction > 0.002)
 
 

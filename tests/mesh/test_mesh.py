@@ -81,29 +81,24 @@ def test_a_surface_encloses_volumes_where_each_edge_has_two_faces_of_one_orienta
     box = trimesh.creation.box()
     corners = np.asarray(box.vertices)
     faces = np.asarray(box.faces)
+    inside_out = faces[:, ::-1]
 
-    def closed(vertices, faces):
-        return encloses_volumes(trimesh.Trimesh(vertices, faces, process=False))
+    def closed(vertices, *parts):
+        surface = trimesh.Trimesh(np.vstack(vertices), np.vstack(parts), process=False)
+        return encloses_volumes(surface)
 
     assert closed(corners, faces)
     assert closed(1e-4 * corners + 50.0, faces)
-    two = (
-        np.concatenate([faces, faces + len(corners)]),
-        np.concatenate([faces, faces[:, ::-1] + len(corners)]),
-    )
-    assert closed(np.concatenate([corners, corners + 3.0]), two[0])
-    assert not closed(np.concatenate([2.0 * corners, corners + 3.0]), two[1]), "one inside out"
-    assert not closed(corners, faces[:, ::-1])
+    assert closed([corners, corners + 3.0], faces, faces + 8)
+    assert not closed([2.0 * corners, corners + 3.0], faces, inside_out + 8), "one inside out"
+    assert not closed(corners, inside_out)
     assert not closed(corners, faces[:0])
-    # not welded
-    assert closed(corners[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))
-    assert closed(corners, np.concatenate([faces, [[0, 0, 1]]]))  # without area
+    assert closed(corners[faces].reshape(-1, 3), np.arange(36).reshape(12, 3)), "not welded"
+    assert closed(corners, faces, [[0, 0, 1]]), "one without area"
     assert not closed(corners, faces[1:])
-    assert not closed(corners, np.concatenate([faces, faces[:1]]))
-    assert not closed(corners, np.concatenate([faces[:1, ::-1], faces[1:]]))
-    assert not closed(
-        np.concatenate([corners, corners]), np.concatenate([faces, faces + len(corners)])
-    )
+    assert not closed(corners, faces, faces[:1])
+    assert not closed(corners, inside_out[:1], faces[1:])
+    assert not closed([corners, corners], faces, faces + 8)
 
 
 def test_edges_of_one_vertex_are_neighbours():

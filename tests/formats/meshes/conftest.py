@@ -8,7 +8,7 @@ from curvireg_torch.formats.meshes import cad, usd
 from tests._support.meshes import load as load
 from tests._support.programs import run_here
 from tests._support.refusals import refused as refused_input
-from tests.formats.meshes.packages import threemf
+from tests.formats.meshes.packages import robot, stage, threemf
 
 
 @pytest.fixture
@@ -34,6 +34,18 @@ def loaded(tmp_path):
 def read_3mf(tmp_path, load):
     """Write a 3MF file, and load it."""
     return lambda *content, **more: load(threemf(tmp_path / "a.3mf", *content, **more))
+
+
+@pytest.fixture
+def read_urdf(tmp_path, load):
+    """Write a URDF file of one link, and load it; its warnings do not count."""
+    return lambda *visuals, **more: load(robot(tmp_path / "a.urdf", *visuals, **more))[0]
+
+
+@pytest.fixture
+def read_usd(write, load):
+    """Write a USD file of these parts, and load it."""
+    return lambda *parts, **about: load(write("part.usda", stage(*parts, **about)))
 
 
 @pytest.fixture

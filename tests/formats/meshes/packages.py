@@ -1,4 +1,4 @@
-"""3MF files, which are zip archives, and URDF files."""
+"""3MF files, which are zip archives, URDF and USD files."""
 
 import zipfile
 
@@ -46,3 +46,9 @@ def robot(path, *visuals, more=""):
 
 def mesh_of_robot(name, more=""):
     return f'<geometry><mesh filename="{name}" {more}/></geometry>'
+
+
+def stage(*parts, about='metersPerUnit = 0.001\n    upAxis = "Z"', place=""):
+    """The text of a USD file."""
+    body = "\n".join(parts)
+    return f'#usda 1.0\n(\n    {about}\n)\ndef Xform "part"\n{{\n{place}{body}\n}}\n'

@@ -16,11 +16,11 @@ from curvireg_torch.formats.meshes.colours import SurfaceColours, colours_of_par
 from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, colour_bytes
 from curvireg_torch.utils.extras import is_installed
 from tests._support.tables import text_table
-from tests.formats.meshes.packages import mesh_of_robot, model, robot, solid, threemf
+from tests.formats.meshes.packages import mesh_of_robot, model, solid, threemf
 from tests.formats.meshes.pictures import painted
 from tests.formats.meshes.test_gltf import TRIANGLE, Tree, coordinates, skinned, textured
 from tests.formats.meshes.test_ply import FACES, RGB, UV, header, rows
-from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, square, stage, write_print
+from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, square, write_print
 
 needs_usd = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
 pytestmark = pytest.mark.usefixtures("here")
@@ -239,64 +239,60 @@ def wedge(folder):
     return mesh_of_robot("wedge.stl", 'scale="1 2 1"')
 
 
-def test_roll_comes_before_pitch_before_yaw(tmp_path, load):
+def test_roll_comes_before_pitch_before_yaw(tmp_path, read_urdf):
     half = math.pi / 2
     origin = f'<origin rpy="{half} 0 {half}" xyz="10 0 0"/>'
-    mesh, _ = load(robot(tmp_path / "a.urdf", wedge(tmp_path) + origin))
+    mesh = read_urdf(wedge(tmp_path) + origin)
     # roll takes y to z and z to -y, yaw x to y and y to -x: (1, 4, 3) -> (3, 1, 4)
     assert_allclose(mesh.bounds, [[10, 0, 0], [13, 1, 4]], atol=1e-6)
     origin = f'<origin rpy="0 {half} {half}"/>'
-    mesh, _ = load(robot(tmp_path / "a.urdf", wedge(tmp_path) + origin))
+    mesh = read_urdf(wedge(tmp_path) + origin)
     # pitch takes x to -z and z to x
     assert_allclose(mesh.bounds, [[-4, 0, -1], [0, 3, 0]], atol=1e-6)
 
 
-def test_a_visual_lies_in_its_link_and_that_at_its_joint(tmp_path, load):
+def test_a_visual_lies_in_its_link_and_that_at_its_joint(tmp_path, read_urdf):
     joint = '<link name="base"/><joint name="j" type="fixed"><parent link="base"/>'
     joint += f'<child link="tip"/><origin rpy="0 0 {math.pi / 2}" xyz="0 0 5"/></joint>'
     visual = wedge(tmp_path) + '<origin xyz="10 0 0"/>'
-    mesh, _ = load(robot(tmp_path / "a.urdf", visual, more=joint))
+    mesh = read_urdf(visual, more=joint)
     assert_allclose(mesh.bounds, [[-4, 10, 5], [0, 11, 8]], atol=1e-6)
 
 
-def test_a_colour_of_a_visual_wins_over_a_named_one(tmp_path, load):
+def test_a_colour_of_a_visual_wins_over_a_named_one(read_urdf):
     named = '<material name="m"><color rgba="1 0 0 1"/></material>'
     own = '<material name="m"><color rgba="0 0 1 1"/></material>'
     box = '<geometry><box size="1 1 1"/></geometry>'
-    assert first_corners(load(robot(tmp_path / "a.urdf", box + own, more=named))[0])[0] == BLUE
+    assert first_corners(read_urdf(box + own, more=named))[0] == BLUE
     bare = '<material name="m"/>'
-    assert first_corners(load(robot(tmp_path / "a.urdf", box + bare, more=named))[0])[0] == RED
+    assert first_corners(read_urdf(box + bare, more=named))[0] == RED
 
 
-def test_colours_of_a_mesh_win_over_those_of_the_urdf(tmp_path, write, load):
+def test_colours_of_a_mesh_win_over_those_of_the_urdf(write, read_urdf):
     write("a.ply", header(RGB) + rows(["0 255 0"] * 4) + FACES)
     own = '<material name="m"><color rgba="0 0 1 1"/></material>'
-    path = robot(tmp_path / "a.urdf", mesh_of_robot("a.ply") + own)
-    assert first_corners(load(path)[0]) == [GREEN, GREEN]
+    assert first_corners(read_urdf(mesh_of_robot("a.ply") + own)) == [GREEN, GREEN]
 
 
 # USD
 
 
 @needs_usd
-def test_helpers_and_holes_are_no_surface(tmp_path, load):
-    path = tmp_path / "a.usda"
+def test_helpers_and_holes_are_no_surface(read_usd):
     for purpose, faces in (("guide", 2), ("proxy", 2), ("render", 4), ("default", 4)):
         other = square(f'uniform token purpose = "{purpose}"').replace('"square"', '"other"')
-        path.write_text(stage(square(), other))
-        assert len(load(path)[0].faces) == faces
+        assert len(read_usd(square(), other)[0].faces) == faces
     holed = square("int[] holeIndices = [0]", counts="3, 3", indices="0, 1, 2, 0, 2, 3")
-    path.write_text(stage(holed))
-    mesh, _ = load(path)
+    mesh, _ = read_usd(holed)
     assert mesh.surface.triangles.tolist() == [[[0, 0, 0], [2, 1, 0], [0, 1, 0]]]
 
 
 @needs_usd
-def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path, write, load):
+def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path, read_usd):
     write_print(tmp_path, painted(RED))
     colour = 'color3f[] primvars:displayColor = [(0, 1, 0)] (interpolation = "constant")\n        '
     plain = square(colour).replace('"square"', '"plain"')
-    mesh, _ = load(write("a.usda", stage(MATERIAL, square(colour + MAP, BOUND), plain)))
+    mesh, _ = read_usd(MATERIAL, square(colour + MAP, BOUND), plain)
     assert first_corners(mesh) == [WHITE, WHITE, GREEN, GREEN]
     assert textures(mesh) == [RED, RED, WHITE, WHITE]
 
@@ -391,9 +387,9 @@ def test_of_a_kind_of_warning_a_few_are_kept(tmp_path):
     assert texts == [*(f"{k} is missing" for k in range(5)), "and more of this kind"]
 
 
-def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path, load):
+def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path, read_urdf):
     threemf(tmp_path / "a.3mf", solid(1), unit='unit="millimeter"')
-    mesh, _ = load(robot(tmp_path / "a.urdf", mesh_of_robot("a.3mf")))
+    mesh = read_urdf(mesh_of_robot("a.3mf"))
     assert mesh.unit == "m"
     assert_allclose(mesh.extents, [0.03, 0.02, 0.01])
 
@@ -413,9 +409,8 @@ def test_colours_of_a_material_in_memory():
         assert found == expected
 
 
-def test_objects_of_one_number_in_two_models_are_no_copies(tmp_path, load):
+def test_objects_of_one_number_in_two_models_are_no_copies(read_3mf):
     move = 'transform="1 0 0 0 1 0 0 0 1 100 0 0"'
     items = f'<item objectid="1"/><item objectid="1" p:path="/3D/b.model" {move}/>'
-    path = threemf(tmp_path / "a.3mf", solid(1), items, more={"3D/b.model": model(solid(1), "")})
-    mesh, _ = load(path)
+    mesh, _ = read_3mf(solid(1), items, more={"3D/b.model": model(solid(1), "")})
     assert mesh.bounds[:, 0].tolist() == [-15, 115]

@@ -31,18 +31,17 @@ def square_with_hole(n):
 def test_triangles_cover_polygons_once_on_their_side_and_convex_ones_are_fans(order, signs):
     """Vectors of area that add up to that of the polygon, and of which none is turned over."""
     rng = np.random.default_rng(0)
-    turns = [
+    stars = [
         np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, n))) * rng.uniform(0.2, 1, n)
         for n in (4, 5, 6, 9, 60)
     ]
-    stars = [np.stack([turn.real, turn.imag], axis=-1) for turn in turns]
     for flat in (
         CONVEX,
         DART,
         np.roll(DART, 1, axis=0),
         U,
         *map(square_with_hole, (3, 8, 40)),
-        *stars,
+        *(star.view(float).reshape(-1, 2) for star in stars),
     ):
         tilted = (np.insert(flat, 2, 0.3 * flat.sum(axis=1), axis=1) * [*signs, 1])[:, order]
         corners = np.array([0, 1, 2, *range(len(tilted))])

@@ -12,6 +12,7 @@ from curvireg_torch.formats.meshes.files import mesh_files
 from curvireg_torch.utils import programs
 from curvireg_torch.utils.extras import is_installed
 from tests._support.refusals import refused
+from tests.formats.meshes.packages import stage
 from tests.formats.meshes.pictures import encoded, painted
 
 pytestmark = [
@@ -63,11 +64,6 @@ def square(more="", api="", counts="4", indices="0, 1, 2, 3"):
     return SQUARE.format(more=more, api=api, counts=counts, indices=indices)
 
 
-def stage(*parts, about='metersPerUnit = 0.001\n    upAxis = "Z"', place=""):
-    body = "\n".join(parts)
-    return f'#usda 1.0\n(\n    {about}\n)\ndef Xform "part"\n{{\n{place}{body}\n}}\n'
-
-
 def textures_of(mesh):
     return [texture[0, 0].tolist() for texture in mesh.colours.textures]
 
@@ -90,22 +86,20 @@ def package(path, text, **more):
     return path
 
 
-def test_places_units_axes_and_polygons(tmp_path, load):
-    path = tmp_path / "part.usda"
+def test_places_units_axes_and_polygons(read_usd):
     place = (
         "    double3 xformOp:translate = (10, 0, 5)\n    double3 xformOp:rotateXYZ = (90, 0, 0)\n"
     )
     place += '    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]\n'
     inner = "double3 xformOp:translate = (0, 0, 7)\n"
     inner += '        uniform token[] xformOpOrder = ["xformOp:translate"]'
-    path.write_text(stage(square(inner), place=place))
-    mesh, texts = load(path)
+    mesh, texts = read_usd(square(inner), place=place)
     assert (mesh.unit, mesh.up, texts) == ("mm", "z", [])
     assert_allclose(mesh.bounds, [[10, -7, 5], [12, -7, 6]], atol=1e-6)
     assert_allclose(mesh.surface.face_normals, [[0, -1, 0]] * 2, atol=1e-6)
     assert not mesh.has_colours
-    path.write_text(stage(square('uniform token orientation = "leftHanded"'), place=place))
-    assert_allclose(load(path)[0].surface.face_normals, [[0, 1, 0]] * 2, atol=1e-6)
+    mesh, _ = read_usd(square('uniform token orientation = "leftHanded"'), place=place)
+    assert_allclose(mesh.surface.face_normals, [[0, 1, 0]] * 2, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -116,32 +110,30 @@ def test_places_units_axes_and_polygons(tmp_path, load):
         ('upAxis = "Z"', "cm", "z", 2.0),  # not stated: OpenUSD's centimetres
     ],
 )
-def test_units_and_axes_are_those_of_the_stage(write, load, about, unit, up, width):
-    path = write("part.usda", stage(square(), about=about))
-    mesh, _ = load(path)
+def test_units_and_axes_are_those_of_the_stage(tmp_path, read_usd, load, about, unit, up, width):
+    mesh, _ = read_usd(square(), about=about)
     assert (mesh.unit, mesh.up) == (unit, up)
     assert mesh.extents[0] == pytest.approx(width)
     if "metersPerUnit" not in about:
-        assert load(path, unit="mm")[0].unit == "mm"
+        assert load(tmp_path / "part.usda", unit="mm")[0].unit == "mm"
 
 
-def test_colours_of_the_mesh(write, load):
+def test_colours_of_the_mesh(read_usd):
     colours = "color3f[] primvars:displayColor = [(1, 0, 0), (0, 0, 1)]"
     more = colours + ' (interpolation = "uniform")'
-    path = write("part.usda", stage(square(more, counts="3, 3", indices="0, 1, 2, 0, 2, 3")))
-    mesh, _ = load(path)
+    mesh, _ = read_usd(square(more, counts="3, 3", indices="0, 1, 2, 0, 2, 3"))
     assert mesh.colours.corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
     assert mesh.has_colours
 
 
-def test_textures_by_the_coordinates_that_they_name(tmp_path, write, load):
+def test_textures_by_the_coordinates_that_they_name(tmp_path, read_usd, load):
     write_print(tmp_path, encoded([[[255, 0, 0]], [[0, 0, 255]]]))
-    path = write("part.usda", stage(MATERIAL, square(MAP, BOUND)))
-    picture = tmp_path / "textures" / "print.png"
-    assert mesh_files(path) == [path, picture]
-    mesh, texts = load(path)
+    mesh, texts = read_usd(MATERIAL, square(MAP, BOUND))
     colours = mesh.colours
     assert not texts
+    path = tmp_path / "part.usda"
+    picture = tmp_path / "textures" / "print.png"
+    assert mesh_files(path) == [path, picture]
     assert [texture[:, 0].tolist() for texture in colours.textures] == [[[255, 0, 0], [0, 0, 255]]]
     assert colours.uv.tolist() == [[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]]
     picture.unlink()
@@ -169,7 +161,7 @@ def test_textures_lie_beside_the_file_that_names_them(tmp_path, write, load):
         assert textures_of(cr.load_mesh(place)) == [[0, 255, 0]]
 
 
-def test_a_texture_whose_file_is_an_input_of_the_material(write, load):
+def test_a_texture_whose_file_is_an_input_of_the_material(write, read_usd):
     write("print.png", painted((1, 2, 3)))
     named = MATERIAL.replace(
         "asset inputs:file = @textures/print.png@",
@@ -177,20 +169,18 @@ def test_a_texture_whose_file_is_an_input_of_the_material(write, load):
     )
     surface = "        token outputs:surface.connect"
     named = named.replace(surface, f"        asset inputs:picture = @print.png@\n{surface}", 1)
-    assert textures_of(load(write("part.usda", stage(named, square(MAP, BOUND))))[0]) == [[1, 2, 3]]
+    assert textures_of(read_usd(named, square(MAP, BOUND))[0]) == [[1, 2, 3]]
 
 
-def test_textures_are_scaled(tmp_path, load):
+def test_textures_are_scaled(tmp_path, read_usd):
     write_print(tmp_path, painted((255, 255, 255)))
-    path = tmp_path / "part.usda"
     for more, tint, count in (
         ("float4 inputs:scale = (0.2158605, 1, 0, 1)", [128, 255, 0], 0),
         ("float4 inputs:scale = (2, 1, 1, 1)", [255, 255, 255], 1),
         ("float4 inputs:bias = (0.1, 0, 0, 0)", [255, 255, 255], 1),
     ):
         scaled = MATERIAL.replace("asset inputs:file", f"{more}\n            asset inputs:file")
-        path.write_text(stage(scaled, square(MAP, BOUND)))
-        mesh, texts = load(path)
+        mesh, texts = read_usd(scaled, square(MAP, BOUND))
         assert len(texts) == count
         assert mesh.colours.corners[0, 0].tolist() == tint
 
@@ -231,9 +221,9 @@ def test_what_is_not_read_is_refused(refused, text, match):
     refused("part.usda", text, match)
 
 
-def test_other_parts_are_named(write, load):
+def test_other_parts_are_named(read_usd):
     hidden = square('token visibility = "invisible"').replace('"square"', '"hidden"')
-    mesh, texts = load(write("part.usda", stage(square(), '    def Cube "a" {}', hidden)))
+    mesh, texts = read_usd(square(), '    def Cube "a" {}', hidden)
     assert len(mesh.faces) == 2
     assert any("no meshes are left out (Cube)" in text for text in texts)
 
