@@ -62,6 +62,14 @@ Baseline=120
 """
 
 
+NO_LENS = {
+    "my_distortion": [0.0, 0],
+    "distance": 3.0,
+    "distribution": [1],
+    "undistorted": 1,
+    "dist_b": "none",
+    "k7": True,
+}
 JSON = {
     "width first": ({"K": MATRIX, "resolution": [640, 480]}, (), VGA),
     "single keys in a dict": ({**FLAT, "distortion_parameters": {**FOUR, "k3": 0.03}}, BENT, None),
@@ -124,6 +132,9 @@ JSON = {
         (0.0,) * 5,
         VGA,
     ),
+    "python": ({"mtx": MATRIX, "dist": [BENT], "image_size": [640, 480]}, BENT, VGA),
+    "bop": ({**FLAT, **SIZE, "depth_scale": 1.0}, (), VGA),
+    "no distortion": ({"K": MATRIX, **NO_LENS}, (), None),
     "realsense by number": ({**REALSENSE, "coeffs": BENT, "model": 4}, BENT, VGA),
 }
 

@@ -36,18 +36,18 @@ class Tree:
         }
 
     def array(self, values, dtype="f", **more):
+        """The number of the accessor, and of its view."""
         x = np.asarray(values, dtype)
         x = x[:, None] if x.ndim == 1 else x
         kind = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}[x.shape[1]]
         self.data += bytes(-len(self.data) % 4)
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": x.nbytes}
         self.data += x.tobytes()
-        views = self.content["bufferViews"]
-        accessors = self.content["accessors"]
-        stored = {"bufferView": len(views), "componentType": TYPES[dtype]}
-        views.append(view)
-        accessors.append({**stored, "count": len(x), "type": kind, **more})
-        return len(accessors) - 1
+        number = len(self.content["accessors"])
+        stored = {"bufferView": number, "componentType": TYPES[dtype], "count": len(x)}
+        self.content["bufferViews"].append(view)
+        self.content["accessors"].append({**stored, "type": kind, **more})
+        return number
 
     def part(self, indices=None, positions=BOX.vertices, **more):
         part = {"attributes": {"POSITION": self.array(positions)}, **more}
@@ -124,13 +124,10 @@ def test_values_may_lie_apart_behind_others(read):
 
 def sparse(tree, index, values, kind="B"):
     """What an accessor says of ``values`` at places that differ from its own."""
-    accessors = tree.content["accessors"]
-    places = [tree.array(index, kind), tree.array(values, "f")]
-    parts = [{key: accessors[k][key] for key in ("bufferView", "componentType")} for k in places]
     return {
         "count": len(index),
-        "indices": parts[0],
-        "values": {"bufferView": parts[1]["bufferView"]},
+        "indices": {"bufferView": tree.array(index, kind), "componentType": TYPES[kind]},
+        "values": {"bufferView": tree.array(values)},
     }
 
 
@@ -139,8 +136,8 @@ def test_sparse_accessors_replace_some_of_their_values(read, loaded, kind):
     """As exporters write what differs from a copy, or from zeros where there is no view."""
     moved = [0, 7]
     tree = Tree()
-    part = tree.part(BOX.faces)
-    accessor = tree.content["accessors"][part["attributes"]["POSITION"]]
+    tree.part(BOX.faces)
+    accessor = tree.content["accessors"][0]
     accessor["sparse"] = sparse(tree, moved, BOX.vertices[moved] * 3.0, kind)
     expected = BOX.vertices.copy()
     expected[moved] *= 3.0
@@ -167,8 +164,8 @@ SPARSE = """
 @pytest.mark.parametrize(("changes", "match"), text_table(SPARSE))
 def test_damaged_sparse_accessors_are_refused(read, changes, match):
     tree = Tree()
-    part = tree.part(BOX.faces)
-    accessor = tree.content["accessors"][part["attributes"]["POSITION"]]
+    tree.part(BOX.faces)
+    accessor = tree.content["accessors"][0]
     accessor["sparse"] = {**sparse(tree, [1, 255], BOX.vertices[:2]), **changes}
     with refused(match, MeshError):
         read(tree)

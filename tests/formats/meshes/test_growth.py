@@ -146,25 +146,14 @@ def test_names_outside_of_the_folder_are_counted(tmp_path, monkeypatch, bounded)
     bounded(path, "names more than 199 files", source, "MAX_MESH_PARTS", 199)
 
 
-@pytest.mark.parametrize(
-    ("name", "is_possible"),
-    [
-        ("a.png", True),
-        ("textures/" * 63 + "a.png", True),
-        ("textures/" * 64 + "a.png", False),
-        ("t\\" * 64 + "a.png", False),
-        ("a" * 255, True),
-        ("a" * 256, False),
-        ("ä" * 128, False),
-        ("/".join(["a" * 200] * 20), True),
-        ("/".join(["a" * 200] * 21), False),
-        ("a\0b", False),
-        (" ", False),
-        ("\ud800.png", False),
-    ],
-)
-def test_names_that_no_file_has(name, is_possible):
-    assert is_file_name(name) == is_possible
+POSSIBLE = ["a.png", "textures/" * 63 + "a.png", "a" * 255, "/".join(["a" * 200] * 20)]
+IMPOSSIBLE = ["textures/" * 64 + "a.png", "t\\" * 64 + "a.png", "a" * 256, "ä" * 128]
+IMPOSSIBLE += ["/".join(["a" * 200] * 21), "a\0b", " ", "\ud800.png"]
+
+
+@pytest.mark.parametrize("name", POSSIBLE + IMPOSSIBLE)
+def test_names_that_no_file_has(name):
+    assert is_file_name(name) == (name in POSSIBLE)
 
 
 def test_a_long_name_of_a_texture_leaves_the_mesh_alone(tmp_path, write, load):

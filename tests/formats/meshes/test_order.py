@@ -146,8 +146,8 @@ def test_parts_keep_their_own_colours_and_textures(loaded):
     for material in (1, 2, None):
         part = tree.part(None, TRIANGLE, **({} if material is None else {"material": material}))
         part["attributes"]["TEXCOORD_0"] = 1
-    tree.array(np.frombuffer(painted(GREEN), np.uint8), "B")
-    tree.content["images"] += [{"bufferView": len(tree.content["bufferViews"]) - 1}]
+    view = tree.array(np.frombuffer(painted(GREEN), np.uint8), "B")
+    tree.content["images"] += [{"bufferView": view}]
     mesh = loaded(tree)
     assert mesh.colours.texture.tolist() == [0, -1, 1, -1]
     assert textures(mesh) == [WHITE, WHITE, GREEN, WHITE]
