@@ -27,8 +27,8 @@ def check(mask, expected=OBJECT):
     np.testing.assert_array_equal(found, expected)
 
 
-def written(path, values, mode=None):
-    Image.fromarray(values, mode).save(path)
+def written(path, values):
+    Image.fromarray(values).save(path)
     return path
 
 
@@ -130,16 +130,13 @@ def test_masks_of_the_pixels_in_the_file_are_turned_with_the_photograph(
     tmp_path, orientation, form
 ):
     """Where the shape shows it: of a picture that is turned by 90 degrees."""
-    pixels = np.where(OBJECT[..., None], 255, 40).astype(np.uint8).repeat(3, axis=2)
-    Image.fromarray(pixels).save(tmp_path / "photo.png")
-    with_exif(tmp_path / "photo.png", exif(orientation))
-    photo = read_photo(tmp_path / "photo.png")
+    file = written(tmp_path / "photo.png", np.where(OBJECT, 255, 40).astype(np.uint8))
+    with_exif(file, exif(orientation))
+    photo = read_photo(file)
     as_shown = photo.image[0].numpy() == 255
     given = OBJECT if orientation > 4 else as_shown
     mask = written(tmp_path / "mask.png", 255 * given.astype(np.uint8))
     forms = {"path": mask, "array": given, "tensor": torch.from_numpy(np.array(given))}
     for shown in (forms[form], as_shown):
-        item = as_photograph(
-            photo.image, None, mask=mask_as_shown(shown, picture_size(tmp_path / "photo.png"))
-        )
+        item = as_photograph(photo.image, None, mask=mask_as_shown(shown, picture_size(file)))
         assert np.array_equal(item.mask.numpy() >= 0.5, as_shown)

@@ -223,17 +223,18 @@ def test_morph_targets_are_named(read):
     assert "morph targets are left out" in read(tree)[1][0]
 
 
-DAMAGED = """\
+DAMAGED = """
 {"skins": [{"joints": [7]}]}
 {"materials": [{"pbrMetallicRoughness": {"baseColorFactor": [1, 2]}}]}
 {"materials": [{"pbrMetallicRoughness": {"baseColorFactor": "red"}}]}
 {"materials": []}
 {"nodes": [{"mesh": 0, "rotation": [1, 0]}]}
-{"nodes": [{"mesh": 3}]}"""
+{"nodes": [{"mesh": 3}]}
+"""
 
 
-@pytest.mark.parametrize("change", [json.loads(row) for row in DAMAGED.split("\n")])
-def test_damaged_trees_are_refused(read, change):
+@pytest.mark.parametrize("row", text_table(DAMAGED))
+def test_damaged_trees_are_refused(read, row):
     tree = Tree()
     part = tree.part(BOX.faces, material=0)
     part["attributes"] |= {
@@ -244,7 +245,7 @@ def test_damaged_trees_are_refused(read, change):
         "nodes": [{"mesh": 0, "skin": 0}],
         "materials": [{}],
         "skins": [{"joints": [0]}],
-        **change,
+        **row[0],
     }
     with refused("cannot be read as a mesh", MeshError):
         read(tree)
