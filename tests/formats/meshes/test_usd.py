@@ -6,12 +6,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import curvireg_torch as cr
-from curvireg_torch.errors import MeshError
 from curvireg_torch.formats.meshes import usd
 from curvireg_torch.formats.meshes.files import mesh_files
 from curvireg_torch.utils import programs
 from curvireg_torch.utils.extras import is_installed
-from tests._support.refusals import refused
 from tests.formats.meshes.packages import stage
 from tests.formats.meshes.pictures import encoded, painted
 
@@ -185,21 +183,16 @@ def test_textures_are_scaled(tmp_path, read_usd):
         assert mesh.colours.corners[0, 0].tolist() == tint
 
 
-def test_references_stay_in_the_folder(tmp_path, write, load):
-    (tmp_path / "in").mkdir()
+def test_references_stay_in_the_folder(write, refused):
     part = '#usda 1.0\n(\n    defaultPrim = "part"\n)\ndef Xform "part"\n{' + square() + "}\n"
-    (tmp_path / "in" / "other.usda").write_text(part)
-    write("other.usda", part)
-    text = '#usda 1.0\ndef "a" (references = @{name}@)\n{{\n}}\n'
-    path = tmp_path / "in" / "part.usda"
-    path.write_text(text.format(name="./other.usda"))
-    mesh, _ = load(path)
-    assert len(mesh.faces) == 2
-    assert mesh_files(path) == [path, tmp_path / "in" / "other.usda"]
-    for name in ("../other.usda", str(tmp_path / "other.usda")):
-        path.write_text(text.format(name=name))
-        with refused("outside of its folder; flatten it", MeshError):
-            load(path)
+    inner = write("in/other.usda", part)
+    outer = write("other.usda", part)
+    text = '#usda 1.0\ndef "a" (references = @{}@)\n{{\n}}\n'
+    path = write("in/part.usda", text.format("./other.usda"))
+    assert len(cr.load_mesh(path).faces) == 2
+    assert mesh_files(path) == [path, inner]
+    for name in ("../other.usda", outer):
+        refused("in/part.usda", text.format(name), "outside of its folder; flatten it")
 
 
 @pytest.mark.parametrize(
