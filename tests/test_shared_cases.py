@@ -194,7 +194,7 @@ def test_three_boxes_in_one_obj():
 
 REFUSED = """
 m06-stl-length/cut.stl           | it says 12 faces and holds 9: it was cut
-m06-stl-length/zero.stl          | it says 0 faces and holds 12
+m06-stl-length/zero.stl          | it says 0 faces and holds 12: it was cut
 m07-stl-ascii-variants/comma.stl | decimal commas; export it with decimal points
 n45-no-faces/lines.obj           | no faces: a cloud of points, splats or lines
 n45-no-faces/points.obj          | 400 points and no faces: a cloud of points

@@ -177,16 +177,16 @@ ASSETS = """
 
 @needs("collada")
 @pytest.mark.parametrize(("asset", "unit", "up", "scale"), text_table(ASSETS))
-def test_collada_files_keep_their_unit_and_axes(tmp_path, write, load, asset, unit, up, scale):
-    write("a.dae", collada(asset))
-    write("label.png", encoded(noise()))
-    mesh, texts = load(tmp_path / "a.dae")
+def test_collada_files_keep_their_unit_and_axes(write, load, asset, unit, up, scale):
+    picture = write("label.png", encoded(noise()))
+    path = write("a.dae", collada(asset))
+    mesh, texts = load(path)
     assert (mesh.unit, mesh.up, texts) == (unit, up, [])
     assert_allclose(mesh.bounds, np.array([[10, 0, 0], [14, 2, 0]]) * scale, atol=1e-6)
     colours = mesh.colours
     np.testing.assert_array_equal(colours.textures[0], noise())
     assert_allclose(colours.uv[0], [[0, 0], [1, 0], [0, 1]], atol=1e-6)
-    assert tmp_path / "label.png" in mesh_files(tmp_path / "a.dae")
+    assert picture in mesh_files(path)
 
 
 @needs("collada")

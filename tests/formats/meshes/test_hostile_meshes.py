@@ -121,9 +121,8 @@ def test_load_mesh_opens_no_file_outside_the_folder(tmp_path, write, uri):
     folder.mkdir()
     (folder / "link.bin").symlink_to(write("b.bin", POINTS))
     # names that differ in upper and lower case only are searched for: in links to folders too
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "b.bin").write_bytes(POINTS)
-    (folder / "Linked").symlink_to(tmp_path / "other", target_is_directory=True)
+    other = write("other/b.bin", POINTS).parent
+    (folder / "Linked").symlink_to(other, target_is_directory=True)
     content = tree(buffers=[{"byteLength": 36, "uri": uri}])
     refused(folder / "a.gltf", json.dumps(content), "no file of its folder")
 

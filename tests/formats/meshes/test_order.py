@@ -2,7 +2,6 @@
 and on which side a face lies."""
 
 import math
-import zipfile
 from io import BytesIO
 
 import numpy as np
@@ -221,12 +220,9 @@ def test_colours_of_faces_win_over_those_of_vertices(write):
 # 3MF
 
 
-def test_the_model_in_its_usual_place_is_the_first(tmp_path, load):
-    path = threemf(tmp_path / "a.3mf", solid(1))
-    for name in ("a.model", "3D/a.model", "3D/very/3dmodel_b.model"):
-        with zipfile.ZipFile(path, "a") as archive:
-            archive.writestr(name, "<model/>")
-    assert len(load(path)[0].faces) == 12
+def test_the_model_in_its_usual_place_is_the_first(read_3mf):
+    others = dict.fromkeys(("a.model", "3D/a.model", "3D/very/3dmodel_b.model"), "<model/>")
+    assert len(read_3mf(solid(1), more=others)[0].faces) == 12
 
 
 # URDF
@@ -347,13 +343,12 @@ def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(write)
     assert first_corners(mesh) == [[255, 51, 0], WHITE]
 
 
-def test_a_folder_beside_the_mesh_wins_over_one_of_textures(tmp_path):
-    for folder in ("mesh", "textures"):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "a.png").write_bytes(folder.encode())
-    source = MeshSource(tmp_path / "mesh" / "a.obj", [tmp_path / "textures"])
+def test_a_folder_beside_the_mesh_wins_over_one_of_textures(write):
+    beside = write("mesh/a.png", b"mesh")
+    other = write("textures/a.png", b"textures")
+    source = MeshSource(beside.with_name("a.obj"), [other.parent])
     assert source.read("a.png") == b"mesh"
-    (tmp_path / "mesh" / "a.png").unlink()
+    beside.unlink()
     assert source.read("a.png") == b"textures"
     assert source.read("somewhere/else/a.png") == b"textures"
 
@@ -369,13 +364,11 @@ def test_names_do_not_lead_out_of_a_folder_of_textures(tmp_path, write):
 
 
 def test_a_mesh_of_a_robot_may_use_files_of_the_robots_folder(tmp_path, write):
-    (tmp_path / "meshes").mkdir()
-    write("a.mtl", "newmtl red")
-    (tmp_path / "meshes" / "a.obj").write_text("")
+    library = write("a.mtl", "newmtl red")
     robot = MeshSource(tmp_path / "a.urdf")
-    part = robot.beside(tmp_path / "meshes" / "a.obj")
+    part = robot.beside(write("meshes/a.obj", ""))
     assert part.read("a.mtl") == b"newmtl red"
-    assert robot.requested == {tmp_path / "a.mtl"}
+    assert robot.requested == {library}
 
 
 def test_of_a_kind_of_warning_a_few_are_kept(tmp_path):
