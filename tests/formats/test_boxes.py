@@ -87,6 +87,11 @@ YOLO = """
 """
 
 
+def test_a_triangle_on_the_border_is_no_box_of_a_tracker(write):
+    (box,) = read_boxes(write("a.txt", "0 0.1 0.2 0.5 0.9 0.9 1"))
+    assert (box.corners, box.track) == ((0.1, 0.2, 0.9, 1.0), "")
+
+
 @pytest.mark.parametrize(("line", "score", "track", "kind"), text_table(YOLO))
 def test_lines_of_yolo_are_boxes_oriented_boxes_and_polygons(write, line, score, track, kind):
     (box,) = read_boxes(write("a.txt", line))

@@ -135,6 +135,13 @@ JSON = {
     "python": ({"mtx": MATRIX, "dist": [BENT], "image_size": [640, 480]}, BENT, VGA),
     "bop": ({**FLAT, **SIZE, "depth_scale": 1.0}, (), VGA),
     "no distortion": ({"K": MATRIX, **NO_LENS}, (), None),
+    "fisheye script": ({"DIM": [640, 480], "K": MATRIX, "D": BENT}, BENT, VGA),
+    "ARKit": (
+        {"intrinsicMatrix": MATRIX, "intrinsicMatrixReferenceDimensions": SIZE},
+        (),
+        VGA,
+    ),
+    "DepthAI": ({"K": MATRIX, "distortionCoeff": BENT, "cameraType": 0}, BENT, None),
     "realsense by number": ({**REALSENSE, "coeffs": BENT, "model": 4}, BENT, VGA),
 }
 
@@ -169,6 +176,7 @@ REFUSED = [
         "INVERSE_BROWN_CONRADY' is not supported",
     ),
     ({**REALSENSE, "coeffs": BENT, "model": 2}, "'inversebrown' is not supported"),
+    ({"K": MATRIX, "distortionCoeff": BENT, "cameraType": 3}, "'division' is not supported"),
 ]
 FOREIGN = r"""
 {"cameraFocalLength": 24.0, "cameraAperture": [20.9, 11.8]}          | Isaac Sim; write fx = wid
@@ -194,12 +202,17 @@ def test_what_cannot_be_read_is_named(read, content, words):
         read(content)
 
 
-def test_realsense_fisheye_has_room_for_five_coefficients(read):
-    coefficients = [0.02, -0.01, 0.003, -0.001, 0.0]
-    content = {**REALSENSE, "coeffs": coefficients, "model": "Kannala Brandt4"}
-    check_camera(read(content), tuple(coefficients[:4]), VGA, model="fisheye")
+@pytest.mark.parametrize(
+    ("key", "model", "room"), [("model", "Kannala Brandt4", 5), ("cameraType", 1, 14)]
+)
+def test_a_fisheye_may_have_room_for_more_coefficients(read, key, model, room):
+    """As of librealsense and DepthAI."""
+    name = {5: "coeffs", 14: "distortionCoeff"}[room]
+    lens = [0.02, -0.01, 0.003, -0.001]
+    content = {**REALSENSE, name: lens + [0.0] * (room - 4), key: model}
+    check_camera(read(content), tuple(lens), VGA, model="fisheye")
     with refused("expected 4 finite coefficients"):
-        read({**content, "coeffs": [*coefficients[:4], 0.5]})
+        read({**content, name: [*lens, *[0.5] * (room - 4)]})
 
 
 OPENSFM = {

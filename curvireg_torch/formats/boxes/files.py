@@ -25,6 +25,9 @@ ANY_FOLDER = "*"
 ID_LABEL = "id="
 """Start of the label by which a box of a tracker is chosen."""
 
+BEYOND = 0.05
+"""Fraction of a picture by which a tracker's box may leave it."""
+
 Corners = tuple[float, float, float, float]
 
 
@@ -113,17 +116,19 @@ def _yolo(text: str) -> Iterator[ImageBox]:
 def _yolo_box(numbers: Sequence[float]) -> ImageBox | None:
     """The box of the numbers of a line; None if there are too few."""
     count = len(numbers)
+    if count < 4:
+        return None
+    x, y, width, height, *more = numbers
+    corners = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
     ends_with_track = count in (5, 6) and numbers[-1] >= 1.0 and numbers[-1] == int(numbers[-1])
-    if count in (4, 5) or (count == 6 and ends_with_track):
-        x, y, width, height, *more = numbers
-        corners = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+    # else the corners of a triangle, the last of which lies on the border
+    is_box = min(corners) > -BEYOND and max(corners) < 1.0 + BEYOND
+    if count in (4, 5) or (count == 6 and ends_with_track and is_box):
         track = str(int(more.pop())) if ends_with_track else ""
         score = more[0] if more else 1.0
         if score > 1.0:
             raise _refused(f"a score of {score:g}, above 1")
         return ImageBox(corners, True, score=score, track=track)
-    if count < 6:
-        return None
     # of an oriented box or a polygon, behind which a score may stand
     score = numbers[-1] if count % 2 else 1.0
     return ImageBox(_around(numbers[: count - count % 2]), True, score=score)

@@ -56,6 +56,7 @@ ORDER = _names("k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tau_x tau_y")
 
 SIZES = _names("""
     resolution image_size img_size image_resolution size image_shape img_shape image_dimensions imsize frame_size
+    dim img_dim intrinsic_matrix_reference_dimensions
 """)  # noqa: E501
 WIDTH = _names("image_width width w img_width")
 HEIGHT = _names("image_height height h img_height")
@@ -95,6 +96,9 @@ PINHOLE_OF_ZEROS = _names("inversebrown modifiedbrown")
 
 REALSENSE_MODELS = _names("none modifiedbrown inversebrown ftheta brown kannalabrandt4")
 """Models of librealsense by their numbers."""
+
+DEPTHAI_MODELS = _names("perspective fisheye equirectangular division")
+"""The same of DepthAI."""
 
 
 MAX_FRACTION = 4.0  # of focal lengths and principal points in fractions of the picture
@@ -200,12 +204,15 @@ def _read_model(record: Record) -> str | None:
 
 
 def _other_models(record: Record) -> list[str]:
-    """What may be the names of models; librealsense's number as its name."""
+    """What may be the names of models; the numbers of librealsense and DepthAI as names."""
     names = record.words(*OTHER_MODEL_NAMES)
-    numbered = dict(enumerate(REALSENSE_MODELS))
-    index = record.values.get("model")
-    if record.has("coeffs") and isinstance(index, int) and index in numbered:
-        names.append(numbered[index])
+    for key, models, coefficients in (
+        ("model", REALSENSE_MODELS, "coeffs"),
+        ("camera_type", DEPTHAI_MODELS, "distortion_coeff"),
+    ):
+        index = record.get(key)
+        if record.has(coefficients) and isinstance(index, int) and 0 <= index < len(models):
+            names.append(models[index])
     return names
 
 
@@ -231,8 +238,8 @@ def _read_distortion(record: Record, model: str | None) -> list[float]:
     if (inside := record.inside(*DISTORTION)) is not None and inside.get("data") is None:
         return _single_coefficients(inside, model)
     if numbers := record.numbers(*DISTORTION):
-        if model == FISHEYE and len(numbers) == 5 and numbers[4] == 0.0:
-            return numbers[:4]  # librealsense has room for five
+        if model == FISHEYE and len(numbers) > 4 and not any(numbers[4:]):
+            return numbers[:4]  # librealsense has room for five, DepthAI for 14
         return padded(numbers) if len(numbers) < 3 else numbers
     return _single_coefficients(record, model)
 
