@@ -1,10 +1,12 @@
 """A cube in front of a camera, shared by the tests of fits."""
 
 import torch
+import torch.nn.functional as F
 import trimesh
 
 from curvireg_torch import camera_matrix
 from curvireg_torch.fitting.edges import EdgeCrops
+from curvireg_torch.fitting.measured_fit import edges_at
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.registration import fit_contours
@@ -34,9 +36,28 @@ def silhouette(mesh, T):
     return (make_renderer(mesh).render(T[None], K, (128, 128))[0] > 0).float()
 
 
+def crops_of(image, box, mask=None):
+    """The crop of one photograph around its box (4,)."""
+    return EdgeCrops.cut([image], box[None], 0.1, mask)
+
+
 def cube_crops(mask=None):
     """The silhouette of the cube in its pose."""
-    return EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1, mask)
+    return crops_of(silhouette(cube(), CUBE_POSE), BOX, mask)
+
+
+def edges_in(image, box, contours, K, T):
+    """Support and excess of the poses T (N, 4, 4) in one photograph."""
+    index = torch.zeros(len(T), dtype=torch.long)
+    return edges_at(contours, crops_of(image, box), K.expand(len(T), 3, 3), T, index)
+
+
+def random_points(count, centre):
+    """(1, count, 3) points in a cube around a centre, and as many normals (1, count, 2)."""
+    generator = seeded(0)
+    model = centre + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
+    normals = torch.randn(1, count, 2, generator=generator, dtype=torch.float64)
+    return model, F.normalize(normals, dim=-1)
 
 
 def noise():

@@ -10,13 +10,14 @@ from torch.testing import assert_close
 from curvireg_torch import camera_matrix
 from curvireg_torch.fitting import camera_fit
 from curvireg_torch.fitting.contour_problem import ContourProblem
-from curvireg_torch.fitting.edges import EdgeCrops, EdgeField
+from curvireg_torch.fitting.edges import EdgeField
 from curvireg_torch.fitting.least_squares import PointMatches, apply_twist, pixels, project
 from curvireg_torch.fitting.measured_fit import FULL_SIZE_RADII
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.geometry.cameras import projected
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support import SIZE, double, scene, seeded, truck_registrar
+from tests.fitting.cube import crops_of
 
 NEAR = camera_matrix(150.0, 150.0, 119.5, 89.5)  # a wide angle, from where perspective is strong
 
@@ -35,8 +36,8 @@ def near_problem(wrong=1.0):
     """Of a focal length that is wrong by this factor; and the true pose (1, 4, 4)."""
     image, box, T = near_scene()
     K = camera_fit.scaled_cameras(NEAR[None], double([wrong]).log())
-    crops = EdgeCrops.cut([image], box[None], 0.1)
-    return ContourProblem.of(truck_registrar().describer.contours, crops, K), T[None]
+    contours = truck_registrar().describer.contours
+    return ContourProblem.of(contours, crops_of(image, box), K), T[None]
 
 
 def fit(problem, T, prior, matches=None):

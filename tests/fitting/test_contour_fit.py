@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import pytest
@@ -11,9 +12,8 @@ from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.fitting import contour_fit
 from curvireg_torch.fitting.contour_fit import fit_to_edges, short_fit
 from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
-from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask, PosesByPicture
+from curvireg_torch.fitting.edges import EdgeField, ObjectMask, PosesByPicture
 from curvireg_torch.fitting.least_squares import apply_twist, project
-from curvireg_torch.fitting.measured_fit import edges_at
 from curvireg_torch.geometry import axis_angle_from_rotation
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
@@ -28,7 +28,19 @@ from tests._support import (
     skip_unless_products_are_exact,
     slow_after,
 )
-from tests.fitting.cube import BOX, CUBE_POSE, K, cube, cube_crops, fitted, noise, pose, silhouette
+from tests.fitting.cube import (
+    BOX,
+    CUBE_POSE,
+    K,
+    cube,
+    cube_crops,
+    edges_in,
+    fitted,
+    noise,
+    pose,
+    random_points,
+    silhouette,
+)
 
 CENTRE = double([0.2, -0.1, 0.3])
 T = pose([0.3, -0.5, 0.2], [0.1, 0.2, 6.0])[None]
@@ -60,13 +72,8 @@ def problem(distances, heights):
 
 
 def state(count, valid=None):
-    generator = seeded(0)
-    model = CENTRE + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
-    normals = F.normalize(
-        torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1
-    )
     mask = torch.arange(count)[None] < (count if valid is None else valid)
-    return ContourState(T, T, ContourPoints(model, normals, mask, mask))
+    return ContourState(T, T, ContourPoints(*random_points(count, CENTRE), mask, mask))
 
 
 def at(count, *distances):
@@ -89,7 +96,7 @@ def test_edges_are_measured_to_a_fraction_of_a_pixel(side):
     measured = problem(at(9, 1.2 * side, -2.0 * side), [0.5, 0.6]).measured_edges(
         state(9, valid=7), 4.0
     )
-    assert_close(measured.distance[0, :7, 0], torch.full((7,), 1.2 * side, dtype=torch.float64))
+    assert measured.distance[0, :7, 0].tolist() == pytest.approx([1.2 * side] * 7)
     strength = 0.5 * (1.0 - (0.2 / 1.5) ** 2)  # at the nearest whole pixel
     tukey = (1.0 - (1.2 / 4.0) ** 2) ** 2
     assert measured.weight[0, :, 0].tolist() == pytest.approx([strength * tukey] * 7 + [0.0] * 2)
@@ -253,8 +260,7 @@ def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
     assert 0.001 < torch.rad2deg(C.diagonal()[:3].sqrt()).max() < 5.0
     assert int(fit.observable) == 6
     assert float(fit.start_support) < float(fit.edge_support)
-    crops = EdgeCrops.cut([image], box[None], 0.1)
-    support, excess = edges_at(contours, crops, camera[None], fit.transform, FIRST)
+    support, excess = edges_in(image, box, contours, camera, fit.transform)
     assert float(support) == pytest.approx(float(fit.edge_support), abs=0.03)
     assert float(excess) == pytest.approx(float(fit.edge_excess), abs=0.03)
 
@@ -322,6 +328,7 @@ def test_edges_of_a_picture_are_the_same_alone_and_among_others(threads):
         assert alone.amax() > 0.3
 
 
+@cache
 def several():
     """Three photographs of the cube with their own sizes and cameras, and five starts: two, two and
     one, shuffled."""
@@ -379,7 +386,7 @@ def test_start_support_is_at_full_size_and_trustworthy_depends_on_support_or_gai
     off = double([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]])
     start = apply_twist(CUBE_POSE[None], off, mesh_centre(cube()))
     image = silhouette(cube(), CUBE_POSE)
-    expected, _ = edges_at(MeshContours(cube()), cube_crops(), K[None], start, FIRST)
+    expected, _ = edges_in(image, BOX, MeshContours(cube()), K, start)
     fit = fitted(image, start)
     assert_close(fit.start_support, expected)
     assert fit.trustworthy

@@ -8,7 +8,6 @@ import torch
 from torch.testing import assert_close
 
 from curvireg_torch.fitting import details
-from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.rendering.contours import MeshContours
@@ -16,6 +15,7 @@ from curvireg_torch.synthetic import synthesize_photograph
 from tests._support import CAMERA, SIZE, double, eye, seeded
 from tests._support.canisters import box_with_block
 from tests._support.hypotheses import HALF_TURN
+from tests.fitting.cube import crops_of
 
 
 @cache
@@ -31,13 +31,12 @@ def compared(*, unit=1.0, wrong=0.0):
     R = rotation_from_viewpoint(35.0, 30.0, 0.0).double()
     T = transform(R, radius * double([0.0, 0.0, 5.0]))
     image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(1))
-    crops = EdgeCrops.cut([image], box[None], 0.1)
     again = T.clone()
     again[0, 3] += wrong * radius
     poses = torch.stack([T, T @ HALF_TURN, again])
     index = torch.zeros(3, dtype=torch.long)
     K = CAMERA.expand(3, 3, 3)
-    return details.compare_details(MeshContours(mesh), crops, K, poses, index)
+    return details.compare_details(MeshContours(mesh), crops_of(image, box), K, poses, index)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-3])

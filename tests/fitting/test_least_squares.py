@@ -16,7 +16,7 @@ from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.rendering.contours import ContourPoints
 from tests._support import double, eye, seeded, skip_unless_products_are_exact, uniform
-from tests.fitting.cube import K, fitted, pose, silhouette
+from tests.fitting.cube import K, fitted, pose, random_points, silhouette
 
 ZERO = double([0.0, 0.0, 0.0])
 CAMERAS = K[None]
@@ -123,13 +123,9 @@ def test_nearest_rigid_pose_is_orthogonal():
 def cloud(count):
     """Points in a cube with random normals, a pose, the cube's centre, and the derivatives along
     the normals."""
-    generator = seeded(0)
     T = pose([0.3, -0.5, 0.2], [-1.6, -0.4, 6.0])[None]
     centre = double([2.0, 0.5, 0.6])
-    model = centre + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
-    normals = F.normalize(
-        torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1
-    )
+    model, normals = random_points(count, centre)
     _, J = ls.project(model, normals, T, CAMERAS, centre)
     everywhere = torch.ones(1, count, dtype=torch.bool)
     return ContourPoints(model, normals, everywhere, everywhere), T, centre, J

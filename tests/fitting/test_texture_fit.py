@@ -12,9 +12,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.fitting.contour_problem import ContourProblem
-from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.least_squares import apply_twist
-from curvireg_torch.fitting.measured_fit import edges_at
 from curvireg_torch.fitting.texture_fit import (
     CONVINCING_RATIO,
     _TextureRounds,
@@ -32,11 +30,12 @@ from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.contours import MeshContours
 from tests._support import CAMERA, bank_of, double, exact_registrar, slow_after
 from tests._support.cans import can, photograph
+from tests.fitting.cube import crops_of, edges_in
 
 MESH = can()
 R = rotation_from_viewpoint(*double((17.0, 22.0, 0.0))) @ up_rotation("y")
 TRUTH = transform(R[None], double([[0.1, -0.05, 7.0]]))
-BOX = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
+BOX = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)[0].float()
 CENTRE = mesh_centre(MESH)
 CONTOURS = MeshContours(MESH)
 
@@ -60,7 +59,7 @@ def problem_of(renderer, image, drawn):
         drawn.append(samples)
         return render_colour(MESH, T, K, size, renderer=renderer, supersampling=samples)
 
-    crops = EdgeCrops.cut([image], BOX.float(), 0.1)
+    crops = crops_of(image, BOX)
     return draw, renderer, ContourProblem.of(CONTOURS, crops, CAMERA[None]), crops.crops[0]
 
 
@@ -96,9 +95,7 @@ def test_label_determines_the_rotation_about_the_axis(renderer, degrees):
     assert int(found.observable) == 6
     about_axis = R[:, 1] @ found.covariance[0, :3, :3] @ R[:, 1]
     assert about_axis.sqrt().rad2deg() < 10.0
-    crops = EdgeCrops.cut([image()], BOX.float(), 0.1)
-    index = torch.zeros(1, dtype=torch.long)
-    support, excess = edges_at(CONTOURS, crops, CAMERA[None], found.transform, index)
+    support, excess = edges_in(image(), BOX, CONTOURS, CAMERA, found.transform)
     assert float(found.edge_support) == pytest.approx(float(support), abs=0.01)
     assert float(found.edge_excess) == pytest.approx(float(excess), abs=0.01)
 
@@ -115,7 +112,7 @@ def test_can_that_is_turned_far_is_found_from_turned_starts(renderer):
     start = turned_can(28.0)
     alone = fit(renderer, image(), start)
     assert alone is None or error(alone) > 5.0
-    contours = fit_contours(CONTOURS, image(), BOX[0], CAMERA, start)
+    contours = fit_contours(CONTOURS, image(), BOX, CAMERA, start)
     assert int(contours.observable) == 5
     starts = rotated_starts(contours, CENTRE)
     assert len(starts) == 3
@@ -180,7 +177,7 @@ def test_label_does_not_pull_a_pose_out_of_its_limits(monkeypatch):
     views = cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y")
     registrar = exact_registrar(bank_of(MESH, views))
     prior = cr.PosePrior(rotation=turned_can(16.0)[0, :3, :3], within=6.0)
-    free, limited = (registrar([image()], BOX, CAMERA, prior=p)[0] for p in (None, prior))
+    free, limited = (registrar([image()], BOX[None], CAMERA, prior=p)[0] for p in (None, prior))
     assert rotation_error(free.rotation, R) < 1.0
     assert prior.excess(limited.rotation) <= 3.0
     assert limited.hypotheses[0].covariance is not None, "its contours are fitted"
