@@ -44,6 +44,12 @@ def scene(seed):
     return image, box, T
 
 
+def first_scenes(count):
+    """Images, boxes (count, 4) and true poses."""
+    images, boxes, poses = zip(*map(scene, range(count)), strict=True)
+    return list(images), torch.stack(boxes), poses
+
+
 def seen_from(mesh, azimuth, elevation, radii):
     """(4, 4) pose of a mesh whose centre lies straight ahead, so many of its radii away."""
     R = rotation_from_viewpoint(azimuth, elevation, 0.0).double()
@@ -76,6 +82,12 @@ def answer_to(seed, registrar):
 def truck_answer():
     """The result of the first scene by :func:`truck_registrar`."""
     return answer_to(0, truck_registrar())
+
+
+@cache
+def learned_answer():
+    """The result of the first scene by :func:`learned_registrar`."""
+    return answer_to(0, learned_registrar())
 
 
 def degrees_off(result, T):
@@ -115,6 +127,7 @@ def exact_registrar(bank, **options):
     return Registrar(bank, pipeline=replace(bank.pipeline, box_jitter=0.0), **options)
 
 
+@cache
 def truck_registrar(**changes):
     """A registrar of the truck in exact boxes, with changed fields of its pipeline."""
     pipeline = replace(truck_bank().pipeline, **{"box_jitter": 0.0} | changes)

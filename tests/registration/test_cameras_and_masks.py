@@ -27,6 +27,7 @@ from tests._support import (
     scene,
     seeded,
     slow_after,
+    truck_answer,
     truck_registrar,
 )
 
@@ -120,9 +121,8 @@ def test_mask_decides_which_edges_are_the_outline():
     image, box, T = scene(0)
     mask = render_depth(example_mesh(), T, CAMERA, SIZE)[0, 0] > 0
     register = truck_registrar()
-    boxes = box.repeat(3, 1)
-    without, with_mask, wrong = register([image] * 3, boxes, CAMERA, masks=[None, mask, ~mask])
-    assert errors(with_mask, T)[1] < errors(without, T)[1]
+    with_mask, wrong = register([image] * 2, box.repeat(2, 1), CAMERA, masks=[mask, ~mask])
+    assert errors(with_mask, T)[1] < errors(truck_answer(), T)[1]
     assert not torch.equal(wrong.translation, with_mask.translation)
     query = register.matcher.query([image], box[None])
     crop = register.object_mask(query, [as_photograph(image, box, CAMERA, mask=mask)])

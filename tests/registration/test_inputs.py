@@ -15,6 +15,8 @@ from curvireg_torch.registration.photograph import Photograph, as_photographs, c
 from tests._support import (
     CAMERA,
     SIZE,
+    first_scenes,
+    learned_answer,
     learned_registrar,
     scene,
     truck_registrar,
@@ -74,9 +76,9 @@ def test_result_with_a_questionable_camera_is_never_reliable():
     known = learned_registrar()
     pipeline = replace(known.pipeline, fit=FitSettings(reliable=0.0))
     registrar = Registrar(known.bank, pipeline=pipeline)
-    good, bad = (registrar([image], box[None], K)[0] for K in (CAMERA, far))
-    assert good.reliable
-    assert good.warnings == ()
+    bad = registrar([image], box[None], far)[0]
+    assert learned_answer().reliable
+    assert learned_answer().warnings == ()
     assert not bad.reliable
     assert bad.covariance is None
     assert bad.to_dict()["warnings"] == camera_warnings(far, SIZE)
@@ -100,10 +102,10 @@ def test_photographs_are_decoded_once_and_not_kept(tmp_path, monkeypatch):
 
     monkeypatch.setattr(photograph_module, "read_photo", counted)
     monkeypatch.setitem(block.BLOCK, "cpu", 2)
+    images, boxes, _ = first_scenes(6)
     paths = [tmp_path / f"{seed}.png" for seed in range(6)]
-    boxes = torch.stack([scene(seed)[1] for seed in range(6)])
-    for seed, path in enumerate(paths):
-        write_photo(path, scene(seed)[0])
+    for path, image in zip(paths, images, strict=True):
+        write_photo(path, image)
     results = truck_registrar(contours=False)(paths, boxes, CAMERA)
     assert all(result.ok for result in results)
     assert sorted(decoded) == paths, "each once"

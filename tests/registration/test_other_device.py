@@ -6,7 +6,14 @@ from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.rendering.visibility import FaceTests
 from curvireg_torch.rendering.zbuffer import DeviceRenderer
 from curvireg_torch.synthetic import example_mesh
-from tests._support import CAMERA, answer_to, bank_around, exact_registrar, learned_registrar, scene
+from tests._support import (
+    CAMERA,
+    answer_to,
+    bank_around,
+    exact_registrar,
+    first_scenes,
+    learned_registrar,
+)
 
 AGREES = 0.05  # degrees
 
@@ -19,11 +26,6 @@ def elsewhere():
         yield device
 
 
-def photographs(count):
-    images, boxes, _ = zip(*(scene(seed) for seed in range(count)), strict=True)
-    return list(images), torch.stack(boxes)
-
-
 def check_agreement(results, expected):
     for result, other in zip(results, expected, strict=True):
         assert result.ok
@@ -33,7 +35,7 @@ def check_agreement(results, expected):
 
 @pytest.mark.slow
 def test_a_registration_is_computed_on_one_device(elsewhere):
-    images, boxes = photographs(2)
+    images, boxes, _ = first_scenes(2)
     expected = learned_registrar()(images, boxes, CAMERA)
     registrar = exact_registrar(learned_registrar().bank.to(elsewhere))
     check_agreement(registrar(images, boxes, CAMERA), expected)
@@ -52,7 +54,7 @@ def test_a_bank_of_another_device_has_the_same_views(elsewhere):
     torch.testing.assert_close(other.boxes.cpu(), bank.boxes)
     error = (other.descriptors.cpu() - bank.descriptors).abs()
     assert (error > 5e-3).float().mean() < 1e-3  # a pixel of an edge more or less
-    images, boxes = photographs(1)
+    images, boxes, _ = first_scenes(1)
     found = cr.Registrar(other)(images, boxes, CAMERA)
     check_agreement(found, cr.Registrar(bank)(images, boxes, CAMERA))
 
@@ -60,7 +62,7 @@ def test_a_bank_of_another_device_has_the_same_views(elsewhere):
 @pytest.mark.slow
 def test_photographs_in_a_block_have_the_poses_that_they_have_alone(monkeypatch):
     """The backend of devices, on the CPU."""
-    images, boxes = photographs(3)
+    images, boxes, _ = first_scenes(3)
     expected = learned_registrar()(images, boxes, CAMERA)
     registrar = exact_registrar(learned_registrar().bank)
     describer = registrar.describer

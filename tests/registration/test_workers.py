@@ -13,6 +13,7 @@ from tests._support import (
     CAMERA,
     answer_to,
     exact_registrar,
+    first_scenes,
     refused,
     scene,
     truck_bank,
@@ -29,8 +30,9 @@ class EndsItsProcess:
 
 @pytest.mark.slow
 def test_processes_give_the_results_of_one_in_the_same_order(tmp_path):
-    images = [*(scene(seed)[0] for seed in range(3)), str(tmp_path / "missing.png")]
-    boxes = torch.stack([scene(seed)[1] for seed in (0, 1, 2, 0)])
+    images, boxes, _ = first_scenes(3)
+    images.append(str(tmp_path / "missing.png"))
+    boxes = torch.cat([boxes, boxes[:1]])
     expected = Registrar(truck_bank())(images, boxes, CAMERA)
     registrar = Registrar(truck_bank(), workers=2)
     _ = registrar.describer  # renderers cannot be pickled
