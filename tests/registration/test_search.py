@@ -100,22 +100,27 @@ class Scattered(Peak):
         return torch.where(far, -0.6, super().scores(views))
 
 
-def searched(*truth, camera="perspective", frame="own", allowed=0.0, kind=Peak, least_coherent=1):
-    """Error of the rotation in degrees and distance in radii that the search finds on a bank of
-    neighbours, and the matcher; azimuths from ``allowed`` on are allowed."""
+@cache
+def neighbours(camera, frame):
+    """A grid of views, the rotation of its frame, and the bank of these views of a box."""
     mesh = trimesh.creation.box((1, 2, 3))
     pipeline = Pipeline(
         views=ViewPolicy(frame=frame), bank=BankSettings(image_size=32, camera=camera)
     )
     turn = principal_rotation(mesh) if frame == "principal" else eye(3)
     grid = sample_views(azimuth_step=20, elevations=[0, 50], distances=[3.0, 4.5])
-    views = grid.in_frame(turn)
-    bank = bank_of(mesh, views, pipeline=pipeline)
+    return grid, turn, bank_of(mesh, grid.in_frame(turn), pipeline=pipeline)
+
+
+def searched(*truth, camera="perspective", frame="own", allowed=0.0, kind=Peak, least_coherent=1):
+    """Error of the rotation in degrees and distance in radii that the search finds on a bank of
+    neighbours, and the matcher; azimuths from ``allowed`` on are allowed."""
+    grid, turn, bank = neighbours(camera, frame)
     azimuth, elevation, distance = truth
     R = rotation_from_viewpoint(azimuth, elevation).double() @ turn
     matcher = kind(bank, R, distance)
     matcher.turn = turn
-    order = matcher.scores(views).argsort(descending=True, stable=True)[None]
+    order = matcher.scores(bank.views).argsort(descending=True, stable=True)[None]
     matcher.ranking = SimpleNamespace(order=order, allowed=grid.azimuth[None] >= allowed)
     rotation, found = search.search(matcher, None, matcher.ranking, least_coherent=least_coherent)
     return float(rotation_error(rotation, R)), float(found) / (0.5 * 14**0.5), matcher
@@ -206,20 +211,6 @@ def test_an_orthographic_search_keeps_the_distance_that_it_cannot_see():
     assert distance == pytest.approx(3.0)
 
 
-def paper_registrar(**changes):
-    return Registrar(truck_bank().mesh, pipeline=replace(PRESETS["paper"], **changes))
-
-
-@cache
-def paper_bank():
-    """The views of the truck in the preset "paper", and the stages that were shown."""
-    shown = []
-    bank = ViewBank.build(
-        truck_bank().mesh, pipeline=PRESETS["paper"], progress=lambda *x: shown.append(x[0])
-    )
-    return bank, shown
-
-
 def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
     for owner, name in (
         (block, "fit_poses"),
@@ -233,16 +224,16 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
         (Registrar, "object_mask"),
     ):
         monkeypatch.setattr(owner, name, Mock(side_effect=AssertionError("not of the paper")))
-    bank, stages_of_bank = paper_bank()
-    shown = []
-    result = answer_to(0, Registrar(bank, progress=lambda *x: shown.append(x[0])))
-    assert set(stages_of_bank) == {"bank"}
-    assert list(dict.fromkeys(shown)) == ["ranking", "search"]
+    paper = PRESETS["paper"]
+    shown = {}
+    progress = {"progress": lambda stage, *_: shown.setdefault(stage)}
+    bank = ViewBank.build(truck_bank().mesh, pipeline=paper, **progress)
+    result = answer_to(0, Registrar(bank, **progress))
+    assert list(shown) == ["bank", "ranking", "search"]
     assert list(result.ranking.terms) == ["hog", "repeatability"]
     assert len(result.hypotheses) == 1
     assert result.confidence is None
     assert result.hypotheses[0].edge_support is None
-    paper = bank.pipeline
     assert (paper.field, paper.box_jitter) == ("MFC", 0.0)
     assert (paper.search, paper.contours) == (True, False)
     assert len(bank) == 756
@@ -255,11 +246,13 @@ def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh
     turn = rotation_from_viewpoint(70.0, 25.0, 40.0).double()
     T = eye(4)
     T[:3, :3] = turn
-    one, _ = paper_bank()
-    copy = replace(one.mesh, surface=one.mesh.surface.copy().apply_transform(T.numpy()))
-    other = bank_of(copy, pipeline=PRESETS["paper"])
+    mesh = truck_bank().mesh
+    copy = replace(mesh, surface=mesh.surface.copy().apply_transform(T.numpy()))
+    paper = PRESETS["paper"]
+    small = replace(paper, bank=replace(paper.bank, image_size=64))
+    one, other = (bank_of(shape, pipeline=small) for shape in (mesh, copy))
     assert_close(other.rotations.double() @ turn, one.rotations.double(), rtol=0, atol=1e-5)
-    in_frame = one.rotations.double() @ principal_rotation(one.mesh).T
+    in_frame = one.rotations.double() @ principal_rotation(mesh).T
     assert_close(in_frame, paper_views().rotations.double(), rtol=0, atol=1e-5)
     image, box, _ = scene(0)
     first, second = (Registrar(bank)([image], box[None])[0] for bank in (one, other))
@@ -273,7 +266,8 @@ def test_the_search_starts_from_allowed_views_and_ends_within_the_limits():
     image, box, T = scene(0)
     right = float(viewpoint_from_rotation(T[:3, :3])[0])
     prior = PosePrior(azimuth=((right + 90.0) % 360.0, (right + 180.0) % 360.0))
-    result = paper_registrar(views=ViewPolicy(pose="upright"))([image], box[None], prior=prior)[0]
+    pipeline = replace(PRESETS["paper"], views=ViewPolicy(pose="upright"))
+    result = Registrar(truck_bank().mesh, pipeline=pipeline)([image], box[None], prior=prior)[0]
     away = (result.viewpoint[0] - right) % 360.0
     assert 90.0 - 1e-3 <= away <= 180.0 + 1e-3
 
