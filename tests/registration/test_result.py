@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError, LostObjectError
-from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration.result import Axis, ambiguity, likely_rivals
 from tests._support import double, eye, refused
+from tests._support.hypotheses import turned
 from tests._support.results import registration
 
 
@@ -30,18 +30,22 @@ def test_to_dict_replaces_unbounded_deviations_by_null():
 
 
 def test_a_questionable_answer_is_unsure_and_an_improbable_one_no_match():
-    # A high confidence that is not reliable, because of a questionable camera, is no reason to be
-    # sure.
-    sure = replace(registration(covariance=0.01 * eye(6)), probabilities=(0.95,))
+    sure = registration(covariance=0.01 * eye(6))
     for changes, word in (
-        ({}, "reliable"),
+        ({"probabilities": (0.9, 0.0)}, "reliable"),
+        ({"prior_contradiction": "at the limit"}, "reliable"),
+        ({"prior_contradiction": "better outside"}, "unsure"),
         ({"warnings": ("the camera is questionable",)}, "unsure"),
+        ({"probabilities": (0.89, 0.0)}, "unsure"),
         ({"probabilities": (0.4, 0.21)}, "unsure"),
         ({"probabilities": (0.4, 0.19)}, "no match"),
         ({"probabilities": (0.5,)}, "unsure"),
         ({"probabilities": ()}, "unsure"),
     ):
-        assert replace(sure, **changes).verdict == word
+        result = replace(sure, **changes)
+        assert result.verdict == word
+        assert result.reliable == (word == "reliable")
+    assert not replace(sure, probabilities=(torch.nan, 0.0)).reliable
 
 
 LOST = FailedRegistration(LostObjectError("not found"))
@@ -64,10 +68,6 @@ def test_what_no_registration_has_a_photograph_without_a_pose_has_neither():
 
 def test_the_confidence_is_shown_rounded_down():
     assert "confidence 0.89" in repr(registration(confidence=0.897))
-
-
-def turned(*degrees):
-    return torch.stack([rotation_from_viewpoint(d, 0.0, 0.0).double() for d in degrees])
 
 
 def with_each(result, **changes):
@@ -129,19 +129,8 @@ def test_of_several_meshes_none_is_right_where_all_of_them_are_improbable():
     assert found.no_match_probability == pytest.approx(0.2)
 
 
-def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_determine():
-    sure = replace(registration(covariance=0.01 * eye(6)), probabilities=(0.9, 0.0))
-    assert sure.reliable
-    for change in (
-        {"probabilities": (0.89, 0.0)},
-        {"probabilities": (torch.nan, 0.0)},
-        {"probabilities": ()},
-        {"warnings": ("the camera is questionable",)},
-        {"prior_contradiction": "better outside"},
-    ):
-        assert not replace(sure, **change).reliable
-    assert replace(sure, prior_contradiction="at the limit").reliable
-    # Not where all three rotations are unknown, as those of a sphere.
+def test_reliable_needs_a_rotation_that_contours_or_keypoints_determine():
+    """Not where all three rotations are unknown, as those of a sphere."""
     variances = double([9.0, 9.0, 9.0, 1e-4, 1e-4, 1e-4])
     sphere = registration(covariance=torch.diag(variances), confidence=0.95)
     fitted = with_each(sphere, edge_support=0.5)
