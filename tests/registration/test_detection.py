@@ -99,7 +99,7 @@ def test_detected_pose_is_the_true_one(seed, corner, scale):
     K = CAMERA.clone()
     K[:2] *= scale
     K[:2, 2] += 0.5 * scale - 0.5 + torch.tensor(corner)
-    few = replace(bank().pipeline, detection=replace(FEW, min_size=0.1))
+    few = replace(bank().pipeline, detection=replace(FEW, proposals=2, min_size=0.1))
     result = cr.Registrar(bank(), pipeline=few)([image], camera_matrices=K)[0]
     assert (result.detection.box - box).abs().max() < 0.1 * (box[2:] - box[:2]).max()
     degrees, share = errors(result, scene(seed)[2])
@@ -128,18 +128,6 @@ def test_detect_finds_several_instances(registrar):
     assert torch.equal(results[0].detection.boxes[:2], boxes)
     with refused("instances: expected >= 1, got 0"):
         detect(registrar, [image], instances=0)
-
-
-def test_detect_reports_an_object_once(registrar, monkeypatch):
-    """Two proposals lead to the same truck, and two instances are requested."""
-    image, box = pasted_scene(5, (60, 40), 0.9)
-    side = (box[2:] - box[:2]).max()
-    beside = torch.stack([box - 0.36 * side, box + 0.36 * side])
-    assert box_iou(beside[:1], beside[1:]) < 0.5, "distinct proposals"
-    monkeypatch.setattr(registrar, "detector", fixed(beside, [9.0, 8.0]))
-    monkeypatch.setattr(detection_module, "projected_box", lambda *_: box.double())
-    (result,) = detect(registrar, [image], instances=2)[0]
-    assert torch.equal(result.detection.box, box.double())
 
 
 def as_found(result, **changes):
