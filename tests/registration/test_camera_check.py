@@ -15,7 +15,6 @@ from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.least_squares import PointMatches, pixels
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.registration import camera as camera_module
-from curvireg_torch.registration.block import Block
 from curvireg_torch.registration.camera import focal_contradiction, stretch_contradiction
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.photograph import as_photograph
@@ -184,31 +183,22 @@ def test_a_print_that_is_not_found_is_no_evidence(monkeypatch, matches):
     assert by_print[0] < -0.2
 
 
-@pytest.mark.parametrize("keypoints", [0.0, 0.1])
-def test_prints_are_those_of_photographs_in_which_keypoints_count(monkeypatch, keypoints):
-    image, box = near_photograph()
-    nothing = torch.zeros(1, 2)
-    measure = Mock(return_value=(nothing, nothing))
-    monkeypatch.setattr(Block, "printed", lambda *_: keypoints)
-    monkeypatch.setattr(camera_module, "camera_gaps", measure)
-    learned_registrar()([image], box[None], camera(1.0))
-    options = measure.call_args.kwargs
-    assert options["printed"].tolist() == [keypoints > 0.0]
-    assert options["known"].tolist() == [True]
-
-
-def test_reliable_answers_are_compared_each_with_its_own_camera(monkeypatch):
+def test_reliable_answers_are_compared_each_with_its_own_camera_and_print(monkeypatch):
+    """Keypoints count in the last photograph."""
     result, (_, _, pose) = registered(1.0)
     results = [result.scaled(0.2), result, result]
     cameras = torch.stack([camera(factor) for factor in (1.0, 1.25, 1.5)])
     best = replace(Hypotheses.cat([pose] * 3), cameras=cameras)
     item = as_photograph(*near_photograph(), camera(1.0))
-    block = SimpleNamespace(photographs=[item] * 3, printed=lambda _: 0.0)
+    block = SimpleNamespace(photographs=[item] * 3, printed=[0.0, 0.0, 0.1].__getitem__)
     measure = Mock(return_value=(double([[0.0, 0.5]] * 2), double([[0.01, 0.01]] * 2)))
     monkeypatch.setattr(camera_module, "camera_gaps", measure)
     target = SimpleNamespace(describer=None)
     found = camera_module.with_checked_cameras(target, block, None, best, results)
     assert measure.call_args.args[2].cameras.tolist() == cameras[1:].tolist()
+    options = measure.call_args.kwargs
+    assert options["printed"].tolist() == [False, True]
+    assert options["known"].tolist() == [True, True]
     assert found[0].warnings == result.warnings
     assert "not the camera's 500 px" in found[1].warnings[-1]
     assert "not the camera's 600 px" in found[2].warnings[-1]

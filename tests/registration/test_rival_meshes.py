@@ -14,7 +14,15 @@ from curvireg_torch.evidence import Evidence
 from curvireg_torch.fitting.details import ContourDetails
 from curvireg_torch.registration import FailedRegistration, judging, stages
 from curvireg_torch.registration.judging import best_of_meshes, joined
-from tests._support import CAMERA, answer_of, bank_around, learned_registrar, slow_after
+from tests._support import (
+    answer_of,
+    bank_around,
+    learned_registrar,
+    scene,
+    slow_after,
+    truck_answer,
+    truck_bank,
+)
 from tests._support.results import registration
 from tests.registration.test_ties import photograph
 
@@ -138,17 +146,12 @@ def test_details_of_meshes_with_fewer_points_are_filled_with_invalid_ones():
     assert both.valid.sum(dim=1).tolist() == [3, 5]
 
 
-@cache
-def found_in_box():
-    return registered(truck(), bank())
-
-
 @pytest.mark.parametrize("best", [0, 1])
 def test_boxes_are_corrected_for_the_best_mesh_alone(monkeypatch, best):
-    registrar = Registrar([bank(), bank()])
-    image, box, _ = photograph(truck(), 35.0, 25.0, 0)
+    registrar = Registrar([truck_bank()] * 2)
+    image, box, _ = scene(0)
     rough = box - torch.tensor([0.1, 0.0, 0.0, 0.0]) * (box[2] - box[0])
-    one = found_in_box()
+    one = truck_answer()
     first = one.hypotheses[0]
     asked = []
 
@@ -160,5 +163,5 @@ def test_boxes_are_corrected_for_the_best_mesh_alone(monkeypatch, best):
         return [replace(one, hypotheses=hypotheses, probabilities=(0.4,)) for _ in items]
 
     monkeypatch.setattr(stages, "register_boxes", register_boxes)
-    assert registrar([image], rough[None], CAMERA)[0].mesh_index == best
+    assert answer_of(registrar, image, rough).mesh_index == best
     assert asked == [best == 0, best == 1, True]
