@@ -8,7 +8,8 @@ import pytest
 
 def real_data(name):
     """The folder ``name`` of the shared data; skips the test where it is absent."""
-    root = _shared_data()
+    given = os.environ.get("CURVIREG_SHARED_DATA")
+    root = Path(given or Path(__file__).parents[3] / "shared" / "data")
     if not (root / name).is_dir():
         pytest.skip(
             f"no real photographs: {name} is neither in $CURVIREG_SHARED_DATA nor in ../shared/data"
@@ -21,8 +22,3 @@ def real_case(name):
     folder = Path(__file__).parents[1] / "data" / "cases" / name
     assert folder.is_dir(), f"no case {name}"
     return folder
-
-
-def _shared_data():
-    given = os.environ.get("CURVIREG_SHARED_DATA")
-    return Path(given or Path(__file__).parents[3] / "shared" / "data")

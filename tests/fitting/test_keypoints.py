@@ -65,9 +65,16 @@ def mesh():
     return as_mesh(carton())
 
 
+def keypoints_of(mesh):
+    """From half as many views as usual, which take seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(keypoints_module, "VIEWS", 24)
+        return Keypoints(ViewDescriber(mesh, BankSettings()))
+
+
 @cache
 def keypoints():
-    return Keypoints(ViewDescriber(mesh(), BankSettings()))
+    return keypoints_of(mesh())
 
 
 def registrar_of(**views):
@@ -231,13 +238,12 @@ def test_a_pose_needs_enough_keypoints_at_different_places():
 
 
 @pytest.mark.slow
-def test_origin_of_the_mesh_may_be_far_away(monkeypatch):
+def test_origin_of_the_mesh_may_be_far_away():
     """Behind the camera, and a thousand object radii off."""
-    monkeypatch.setattr(keypoints_module, "VIEWS", 24)
     T = pose(20.0)
     away = double([0.0, 0.0, 1000.0])
     moved = as_mesh(carton().apply_translation(away.numpy()))
-    matches = Keypoints(ViewDescriber(moved, BankSettings())).matches(photograph(T), K)
+    matches = keypoints_of(moved).matches(photograph(T), K)
     (found,), _ = matches.poses()
     found[:3, 3] += found[:3, :3] @ away
     check_pose(found, T, 2.0)

@@ -28,13 +28,9 @@ def four(similarity, compare, angles):
 
 
 def test_a_sibling_is_better_by_its_score_and_by_details():
-    for details, best in (
-        ([[0, 0, 0], [0, 0, 0], [0, 0, 0]], 0),
-        ([[0, 0, 0], [0.15, 0, 0], [0, 0, 0]], 0),
-        ([[0, 0, 0], [0.25, 0, 0], [0, 0, 0]], 1),
-        ([[0, 0, 0], [0.25, 0, 0], [1.5, 0, 0]], 2),
-        ([[0, -9, -9], [0, 0, 0], [0, 0, 0]], 0),
-    ):
+    """By what it has before the first one, not by what that one has before it."""
+    for second, third, best in ((0, 0, 0), (0.15, 0, 0), (0.25, 0, 1), (0.25, 1.5, 2)):
+        details = [[0, -9, -9], [second, 0, 0], [third, 0, 0]]
         assert four([0.80, 0.79, 0.70], details, [0, 90, 180]).best() == best
 
 

@@ -55,6 +55,13 @@ def registrar_of(mesh):
     return exact_registrar(bank_around(mesh, 30, [10, 30, 50]))
 
 
+@cache
+def cylinder():
+    """A mesh, and its 72 symmetries."""
+    mesh = trimesh.creation.cylinder(40, 150, sections=72)
+    return mesh, mesh_symmetries(mesh)
+
+
 def photograph(mesh, azimuth, elevation, seed):
     """(3, H, W), its box (4,) and the true ``T_cam_from_model``."""
     T = seen_from(mesh, azimuth, elevation, radii=5.0)
@@ -146,9 +153,8 @@ def test_given_symmetries_are_trusted():
 
 def test_telling_symmetries_are_those_that_a_feature_breaks():
     box = trimesh.creation.box((200, 120, 80))
-    cylinder = trimesh.creation.cylinder(40, 150, sections=72)
-    for mesh in (box, cylinder):
-        assert len(telling_symmetries(mesh, mesh_symmetries(mesh))) == 1, "nothing to measure"
+    for mesh, symmetries in ((box, mesh_symmetries(box)), cylinder()):
+        assert len(telling_symmetries(mesh, symmetries)) == 1, "nothing to measure"
     group = mesh_symmetries(marked_box())
     fractions = feature_fractions(marked_box(), group)
     assert fractions[0] == 0.0
@@ -159,7 +165,7 @@ def test_telling_symmetries_are_those_that_a_feature_breaks():
 
 
 def test_spread_keeps_few_symmetries_far_apart():
-    group = mesh_symmetries(trimesh.creation.cylinder(40, 150, sections=72))
+    _, group = cylinder()
     some = spread(group)
     assert (len(group), len(some)) == (72, MAX_SIBLINGS)
     apart = rotation_error(some[:, None, :3, :3], some[None, :, :3, :3]) + 360.0 * torch.eye(
