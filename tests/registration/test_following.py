@@ -241,27 +241,22 @@ def test_follower_refines_where_tracking_is_doubtful(monkeypatch):
     assert len(calls) == 1
 
 
-@pytest.mark.parametrize(("tracked", "kept"), [(0.19, False), (0.21, True)])
-def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
+@pytest.mark.parametrize(
+    ("tracked", "registered", "expected"),
+    [(0.19, None, None), (0.21, None, 0.21), (0.1, 0.89, None), (0.1, 0.95, 0.95)],
+)
+def test_a_doubtful_pose_is_kept_above_a_limit_and_below_one_that_is_registered_reliably(
+    monkeypatch, tracked, registered, expected
+):
+    image, box, T = sequence(2)[1]
     follow = follower()
     monkeypatch.setattr(tracking, "tracking_confidence", lambda _: tracked)
     monkeypatch.setattr(tracking, "refine_one", LOST)
-    answering(monkeypatch, FailedRegistration(LostObjectError("no")))
-    result = follow(sequence(2)[1][0])
-    assert result.ok == kept
-    assert not kept or result.confidence == pytest.approx(tracked)
-
-
-@pytest.mark.parametrize(("confidence", "used"), [(0.89, False), (0.95, True)])
-def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, confidence, used):
-    image, box, T = sequence(2)[1]
-    follow = follower()
-    monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 0.1)
-    monkeypatch.setattr(tracking, "refine_one", LOST)
-    answering(monkeypatch, answer(T, confidence))
+    failed = FailedRegistration(LostObjectError("no"))
+    answering(monkeypatch, answer(T, registered) if registered else failed)
     result = follow(image, box)
-    assert result.ok == used
-    assert not used or result.confidence == confidence
+    assert result.ok == (expected is not None)
+    assert not result.ok or result.confidence == pytest.approx(expected)
 
 
 @pytest.mark.slow

@@ -110,27 +110,16 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
         (tmp_path / "none.png", BOX, "none.png: no such file"),
         (IMAGE * 255, BOX, r"\[0, 1\]"),
         (torch.zeros(4, 9, 9), BOX, "channels"),
+        (IMAGE, None, "has neither box nor mask"),
         strict=True,
     )
     first, *failed, last = truck_registrar(contours=False)(
-        [IMAGE, *images, IMAGE], torch.stack([BOX, *boxes, BOX]), CAMERA
+        [IMAGE, *images, IMAGE], [BOX, *boxes, BOX], CAMERA
     )
     assert first.rotation.equal(last.rotation)
     for i, (result, message) in enumerate(zip(failed, messages, strict=True), start=1):
         with refused(f"image {i}: .*{message}", CurviregError):
             _ = result.rotation
-
-
-def test_a_photograph_without_a_box_among_others_is_refused_and_not_taken_as_a_whole():
-    registrar = truck_registrar(contours=False)
-    white = torch.ones(IMAGE.shape[1:], dtype=torch.bool)
-    first, second, masked = registrar(
-        [IMAGE] * 3, [BOX, None, None], CAMERA, masks=[None, None, white]
-    )
-    assert first.ok
-    assert masked.ok
-    with refused("image 1: has neither box nor mask"):
-        _ = second.rotation
 
 
 @pytest.mark.parametrize(
