@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from curvireg_torch import Pipeline, Registrar, rotation_error, sample_views
-from curvireg_torch.evidence import Evidence, EvidenceWeights
+from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.measured_fit import edges_at
 from curvireg_torch.geometry import rotation_from_viewpoint
@@ -30,6 +30,7 @@ from tests._support import (
     truck_answer,
     truck_registrar,
 )
+from tests._support.hypotheses import evidence_of
 from tests._support.results import FEATURES
 
 R30 = sample_views(azimuth_step=12, elevations=[0]).rotations
@@ -110,14 +111,14 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
 
 
 def test_confidence_features():
-    evidence = Evidence(
-        rank=double([0.0, -1.0, -2.0]),
-        similarity=double([0.7, 0.6, 0.5]),
-        edge_support=double([0.4, 0.5, 0.1]),
-        appearance=double([1.0, 0.4, 0.8]),
-        keypoints=double([2.0, 0.0, 3.0]),
-        details=double([0.5, 0.0, 0.0]),
-        contours=double([0.9, 0.8, 1.0]),
+    evidence = evidence_of(
+        rank=[0.0, -1.0, -2.0],
+        similarity=[0.7, 0.6, 0.5],
+        edge_support=[0.4, 0.5, 0.1],
+        appearance=[1.0, 0.4, 0.8],
+        keypoints=[2.0, 0.0, 3.0],
+        details=[0.5, 0.0, 0.0],
+        contours=[0.9, 0.8, 1.0],
     )
     scores = double([5.5, 2.0, 3.0])
     doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0, "focal": 0.3}

@@ -29,11 +29,6 @@ from tests._support import (
 from tests._support.hypotheses import HALF_TURN
 
 
-@pytest.fixture(scope="module")
-def registrar():
-    return truck_registrar()
-
-
 def moved(T, degrees=0.0, distance=0.0, axis=(0.6, 0.0, 0.8)):
     out = T.clone()
     vector = double(axis) * torch.deg2rad(double(degrees))
@@ -54,18 +49,18 @@ CHANGES = [
     slow_after(4, [(2, {"degrees": 20, "axis": (0.0, 1.0, 0.0)}), *CHANGES]),
     ids=str,
 )
-def test_refine_ends_at_the_truth(registrar, seed, change):
+def test_refine_ends_at_the_truth(seed, change):
     image, _, T = scene(seed)
-    result = registrar.refine([image], CAMERA, [moved(T, **change)])[0]
+    result = truck_registrar().refine([image], CAMERA, [moved(T, **change)])[0]
     rotation, position = errors(result, T)
     assert rotation < 2.0
     assert position < 0.02
 
 
-def test_refine_reports_the_best_of_several_starts(registrar):
+def test_refine_reports_the_best_of_several_starts():
     image, _, T = scene(0)
     starts = torch.stack([moved(T, degrees=170.0, axis=(0.0, 1.0, 0.0)), moved(T, degrees=5.0)])
-    result = registrar.refine([image], CAMERA, [starts])[0]
+    result = truck_registrar().refine([image], CAMERA, [starts])[0]
     assert errors(result, T)[0] < 2.0
     assert result.edge_support == max(h.edge_support for h in result.hypotheses)
     assert rotation_error(result.hypotheses[-1].rotation, T[:3, :3]) > 90.0
@@ -83,7 +78,7 @@ def test_refine_loses_or_doubts_an_object_that_is_not_there(seed):
             _ = result.rotation
 
 
-def test_refine_refuses_wrong_arguments_and_a_start_that_does_not_show_the_mesh(registrar):
+def test_refine_refuses_wrong_arguments_and_a_start_that_does_not_show_the_mesh():
     for move, message in (
         ((0.0, 0.0, -100.0), "outside the photograph"),
         ((50.0, 0.0, 0.0), "outside the photograph"),
@@ -93,7 +88,7 @@ def test_refine_refuses_wrong_arguments_and_a_start_that_does_not_show_the_mesh(
         image, _, T = scene(0)
         T = T.clone()
         T[:3, 3] += torch.tensor(move)
-        unreadable, result = registrar.refine(["none.png", image], CAMERA, [T, T])
+        unreadable, result = truck_registrar().refine(["none.png", image], CAMERA, [T, T])
         assert "none.png" in str(unreadable.error)
         with refused(f"^image 1: .*{message}", LostObjectError):
             _ = result.rotation
@@ -104,14 +99,14 @@ def test_refine_refuses_wrong_arguments_and_a_start_that_does_not_show_the_mesh(
         ([torch.eye(3)], CAMERA, "poses"),
     ):
         with refused(message):
-            registrar.refine([scene(0)[0]], camera, poses)
+            truck_registrar().refine([scene(0)[0]], camera, poses)
 
 
 @pytest.mark.parametrize(("confidence", "ok"), [(0.34, False), (0.36, True)])
-def test_refine_calls_the_object_lost_below_its_limit(registrar, monkeypatch, confidence, ok):
+def test_refine_calls_the_object_lost_below_its_limit(monkeypatch, confidence, ok):
     monkeypatch.setattr(refinement, "refinement_confidence", lambda _: confidence)
     image, _, T = scene(0)
-    assert registrar.refine([image], CAMERA, [T])[0].ok is ok
+    assert truck_registrar().refine([image], CAMERA, [T])[0].ok is ok
 
 
 @pytest.mark.slow

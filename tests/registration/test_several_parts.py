@@ -1,13 +1,11 @@
 """The joint result of a rig in closed cases: probabilities, contributions, doubts."""
 
-from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError, LostObjectError
-from curvireg_torch.evidence import Evidence
 from curvireg_torch.geometry import Camera
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.registration import several
@@ -15,6 +13,7 @@ from curvireg_torch.registration.confidence import hypothesis_probabilities
 from curvireg_torch.registration.photograph import as_photograph, copies_of
 from curvireg_torch.registration.rig import JointPoses
 from tests._support import double, eye, refused
+from tests._support.hypotheses import evidence_of
 
 ANY_RIGHT = 0.8
 EYE = eye(4)
@@ -64,11 +63,10 @@ class FakeRig:
 
     def answer(self):
         rows = double([self.scores[p.index] for p in self.photographs])
-        nothing = torch.zeros_like(rows)
-        values = Evidence(*[nothing] * len(fields(Evidence)))
+        evidence = evidence_of(similarity=(0.1 * rows).tolist())
         M = rows.shape[1]
         C = torch.full((M, 6, 6), torch.nan).double()
-        return JointPoses(EYE.repeat(M, 1, 1), replace(values, similarity=0.1 * rows), rows, C)
+        return JointPoses(EYE.repeat(M, 1, 1), evidence, rows, C)
 
     def lost(self, _):
         there = [p.index for p in self.photographs]
