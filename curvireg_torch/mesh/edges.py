@@ -14,6 +14,10 @@ WELD = 1e-6  # Vertices nearer than this fraction of the mesh's longest side are
 CREASE_ANGLE = 15.0  # Degrees between two faces from which their common edge is a crease
 # Degrees between two faces below which the surface counts as smooth across their edge
 SMOOTH_ANGLE = 40.0
+# Radius to which a mesh is scaled to be simplified: the tolerances of fast_simplification are
+# absolute, and grow until there are few enough faces. Of 95 real meshes, cut to 800 faces at this
+# radius, 9 lose more than 2 % of their surface (beyond 0.05 radii), in metres 29
+SIMPLIFIED_RADIUS = 1000.0
 # Faces of an edge that are looked at; polygon soups have edges with more than two
 MAX_EDGE_FACES = 4
 
@@ -113,16 +117,17 @@ def encloses_volumes(mesh: trimesh.Trimesh) -> bool:
 
 def simplified(mesh: trimesh.Trimesh, centre: Floats, max_faces: int) -> tuple[Floats, Integers]:
     """Vertices (V, 3) float64 relative to ``centre`` and faces (F, 3) of a mesh, welded, F at most
-    about ``max_faces``."""
+    about ``max_faces``; more where fewer would lose parts of it."""
     vertices, faces = _welded(
         np.asarray(mesh.vertices, np.float64) - centre, np.asarray(mesh.faces)
     )
     if len(faces) <= max_faces:
         return vertices, faces
+    scale = SIMPLIFIED_RADIUS / np.abs(vertices).max()
     points, triangles = fast_simplification.simplify(
-        vertices.astype(np.float32), faces.astype(np.int32), target_count=max_faces
+        (scale * vertices).astype(np.float32), faces.astype(np.int32), target_count=max_faces
     )
-    return _welded(points.astype(np.float64), triangles)
+    return _welded(points.astype(np.float64) / scale, triangles)
 
 
 def _welded(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 
 from curvireg_torch.mesh.edges import MeshEdges, occluding_edges, simplified
+from curvireg_torch.mesh.sampling import surface_points
+from curvireg_torch.synthetic import example_mesh
 from tests._support.tables import text_table
 
 
@@ -95,3 +98,17 @@ def test_doubled_faces_count_once_and_those_without_area_never(flipped):
     edges = edges_of(corners, [*faces, *again, [0, 0, 1]])
     assert kind_of_spine(edges) == (False, True)
     assert len(edges.faces) == 2
+
+
+@pytest.mark.parametrize("radius", [0.1, 100.0])
+@pytest.mark.parametrize("faces", [800, 2500, 8000])
+def test_no_part_of_a_fine_mesh_is_lost_whatever_its_unit(faces, radius):
+    """In metres, all but one of the truck's parts were collapsed."""
+    mesh = example_mesh()
+    for _ in range(3):
+        mesh = mesh.subdivide()
+    mesh.apply_scale(radius / np.abs(mesh.vertices).max())
+    vertices, triangles = simplified(mesh, np.zeros(3), faces)
+    found = cKDTree(surface_points(trimesh.Trimesh(vertices, triangles, process=False), 20_000))
+    distance, _ = found.query(surface_points(mesh, 2_000, seed=1))
+    assert distance.max() < 0.06 * radius
