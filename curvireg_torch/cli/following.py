@@ -32,8 +32,8 @@ from ..jobs.opening import open_registrar
 from ..jobs.options import CAMERA_OPTIONS, RegisterOptions, prior_from_limits
 from ..jobs.outputs import output_folder
 from ..registration import FailedRegistration, Follower, Registrar, Registration, refine
-from ..registration.confidence import two_decimals
-from ..registration.tracking import BELIEVED_CONFIDENCE
+from ..registration.confidence import is_calibrated, two_decimals
+from ..registration.tracking import BELIEVED_CONFIDENCE, KEPT_CONFIDENCE
 from ..utils.aliases import Fields
 from ..utils.files import CsvFile
 from ..utils.threads import one_torch_thread
@@ -81,7 +81,7 @@ class Tally:
         best = ""  # pipelines without calibration have no confidence
         if self.best_confidence > 0.0:
             best = f" (best confidence {two_decimals(self.best_confidence)})"
-        return f"not sure of the object yet{best}; give --box or --start"
+        return f"not sure of the object yet{best}; give --box, or --start near the pose"
 
     @property
     def posed(self) -> int:
@@ -207,6 +207,8 @@ def _poses(
                 follow = Follower(registrar, _camera(options, photo), prior=prior)
                 start = options.read_start()
             result = follow(image, box) if start is None else _started(follow, image, start)
+            if isinstance(result, Registration) and not is_calibrated(registrar.pipeline):
+                result = replace(result, probabilities=())
         except CurviregError as error:
             if follow is None and options.boxes is None:
                 raise  # it would fail in each frame
@@ -225,7 +227,11 @@ def _started(
     (found,) = refine(registrar, [image], follow.camera_matrix, [pose], start_confidences=limit)
     if isinstance(found, Registration):
         known, _ = found.projection
-        follow.start(image, known, confidence=1.0 if found.confidence is None else found.confidence)
+        confidence = found.confidence
+        if confidence is None:  # pipelines without calibration
+            confidence = 1.0 if start.confidence is None else start.confidence
+        if confidence >= KEPT_CONFIDENCE:
+            follow.start(image, known, confidence=confidence)
     return found
 
 

@@ -177,12 +177,12 @@ def as_photographs(
     if isinstance(boxes, list | tuple) and any(_is_missing(box) for box in boxes):
         given = [
             None if _is_missing(box) else as_boxes([box], 1)[0]
-            for box in _one_each(boxes, n, "boxes")
+            for box in one_each(boxes, n, "boxes")
         ]
     else:
         given = [None] * n if boxes is None else list(as_boxes(boxes, n))
     cameras = _cameras(camera_matrices, n)
-    masks = [None] * n if masks is None else _one_each(masks, n, "masks")
+    masks = [None] * n if masks is None else one_each(masks, n, "masks")
     if no_box and any(m is None for m in masks) and any(m is not None for m in masks):
         raise InvalidInputError(
             f"masks: image {masks.index(None)} has neither mask nor box; register it separately"
@@ -227,13 +227,13 @@ def check_cameras(images: Any, camera_matrices: CameraLike | None, what: str) ->
         raise InvalidInputError(f"{what}: needs the camera matrix of each photograph")
 
 
-def _one_each(values: Iterable[Any], count: int, name: str) -> list[Any]:
-    values = list(values)
-    if len(values) != count:
-        raise InvalidInputError(
-            f"{name}: expected {count}, one for each image or None, got {len(values)}"
-        )
-    return values
+def one_each(values: Any, count: int, name: str) -> list[Any]:
+    """The values of ``count`` images as a list."""
+    every = list(values) if isinstance(values, Iterable) else None
+    if every is None or len(every) != count:
+        got = type(values).__name__ if every is None else len(every)
+        raise InvalidInputError(f"{name}: expected {count}, one for each image or None, got {got}")
+    return every
 
 
 def _is_missing(box: BoxLike | None) -> bool:

@@ -12,7 +12,7 @@ from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..fitting.edges import EdgeCrops
 from ..geometry.framing import boxes_at
 from ..matching import Ranking
-from ..utils.checks import as_numbers, check_pose, check_probability
+from ..utils.checks import as_numbers, check_pose, check_probability, check_tensor
 from ..utils.likes import ArrayLike, CameraLike, ImagesLike
 from ..utils.precision import exact_convolutions
 from .block import Described, evidence_of
@@ -25,7 +25,14 @@ from .hypotheses import (
     fit_texture_of,
     hypothesis_of,
 )
-from .photograph import MIN_BOX_SIDE, Photograph, as_photographs, check_cameras, check_crop
+from .photograph import (
+    MIN_BOX_SIDE,
+    Photograph,
+    as_photographs,
+    check_cameras,
+    check_crop,
+    one_each,
+)
 from .result import FailedRegistration, Registration, Results
 from .stages import Items, failure, register
 from .target import Target, nearest_view
@@ -154,16 +161,18 @@ def refine_prepared(
 ) -> Results:
     """:func:`refine` in photographs that :func:`.as_photographs` has prepared without boxes."""
     starts = []
-    for one in poses:
+    for one in one_each(poses, len(items), "poses"):
         T = as_numbers(one, "poses", dtype=torch.float64).cpu()
-        starts.append(T[None] if T.ndim == 2 else T)
+        T = T[None] if T.ndim == 2 else T
+        check_tensor(T, "poses", (None, 4, 4))
         check_pose(T, "poses")
-    limits = [None] * len(items) if start_confidences is None else list(start_confidences)
+        if not len(T):
+            raise InvalidInputError("poses: no start; give one, or leave the photograph out")
+        starts.append(T)
+    limits = [None] * len(items)
+    if start_confidences is not None:
+        limits = one_each(start_confidences, len(items), "start_confidences")
     limits = [None if c is None else check_probability(c, "start_confidences") for c in limits]
-    if len(starts) != len(items) or len(limits) != len(items):
-        raise InvalidInputError(
-            f"refine: expected starts of {len(items)} photographs, got {len(starts)}"
-        )
     results: Results = []
     with exact_convolutions():
         # items are read on demand, so that few are in memory

@@ -29,6 +29,8 @@ from .rig import ELSEWHERE, JointPoses, Rig, RigPhotograph, RigPhotographs
 from .stages import register_photographs
 from .target import Target
 
+# Distance of two places, as a fraction of that of the camera, from which they are different ones
+OTHER_PLACE = 0.15
 # Hypotheses of each photograph that are compared in all, even if fewer are reported
 JOINT_HYPOTHESES = 5
 
@@ -67,7 +69,7 @@ def register_views(
     Raises:
         InvalidInputError: no photograph can be registered; a camera's pose is not rigid; two
             photographs that differ come from the same place; or lengths of the cameras and of the
-            mesh have different units.
+            mesh differ by a factor of 30 and more, as mm and m do.
 
     Example:
         >>> import curvireg_torch as cr
@@ -122,7 +124,7 @@ def _registered_to(
         if isinstance(item, CurviregError):
             found[i] = item
         elif i in copies:
-            found[i] = InvalidInputError(f"a copy of image {copies[i]}, which counts once")
+            found[i] = InvalidInputError("a copy of an earlier photograph, which counts once")
         else:
             photographs[i] = item
     if given := {i: item for i, item in photographs.items() if item.has_box}:
@@ -242,7 +244,8 @@ def _joint_probabilities(
 ) -> tuple[float, ...]:
     """Probabilities of the poses with the sums ``total`` (M,) of scores in a ``rig``, which has
     ``every`` photograph but those that do not show the best pose: where these are confident of
-    another one, that speaks against it."""
+    another rotation, that speaks against it; so does another place, unless most photographs show
+    the pose: a wrong camera is out-voted."""
     probabilities = rig.photographs[0].result.probabilities
     if len(rig.photographs) > 1:
         found_in = [p.result.detection for p in every.photographs]
@@ -251,8 +254,14 @@ def _joint_probabilities(
         probabilities = hypothesis_probabilities(any_right, total, exact=rig.exact)
     odds = probabilities[0] / max(1.0 - probabilities[0], 1e-9)
     counted = {p.index for p in rig.photographs}
+    is_majority = 2 * len(counted) > len(every.photographs)
+    place = rig.centres(answer.T[:1])
     for p in every.photographs:
-        if p.index not in counted and rig.angles(p.poses[:1], answer.T[:1]) > RIVAL_ANGLE:
+        if p.index in counted:
+            continue
+        away = torch.linalg.vector_norm(rig.centres(p.poses[:1]) - place)
+        is_elsewhere = not is_majority and bool(away > OTHER_PLACE * p.result.distance)
+        if is_elsewhere or rig.angles(p.poses[:1], answer.T[:1]) > RIVAL_ANGLE:
             other = p.result.confidence or 0.0
             odds *= min(1.0, (1.0 - other) / max(other, 1e-9))
     factor = odds / (1.0 + odds) / max(probabilities[0], 1e-9)

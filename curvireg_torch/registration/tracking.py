@@ -471,9 +471,8 @@ class Follower:
             else [tracked.state.T, self._tracker.last_pose]
         )
         refined = self._refined(item, torch.cat(starts))
-        if isinstance(refined, Registration) and _confidence(refined) >= (
-            0.0 if found is None else _confidence(found)
-        ):
+        least = max(KEPT_CONFIDENCE, 0.0 if found is None else _confidence(found))
+        if isinstance(refined, Registration) and _confidence(refined) >= least:
             # track on from it, if it lies within the frame
             with suppress(LostObjectError, ImageError):
                 self._tracker.accept(

@@ -4,6 +4,7 @@ import pickle
 import re
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -17,6 +18,7 @@ from curvireg_torch import data
 from curvireg_torch.cli import following, main
 from curvireg_torch.cli.following import Tally
 from curvireg_torch.data import Photo, Video
+from curvireg_torch.formats.poses import PoseRecord
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.jobs.outputs import MARKER
@@ -94,7 +96,7 @@ def test_frames_without_a_certain_pose_are_spoken_of_once(confidences, said):
     tally = Tally()
     for confidence, words in zip(confidences, said, strict=True):
         tally.add({"verdict": "unsure", "confidence": confidence}, 1.0)
-        assert tally.doubt() == (words and f"{words}; give --box or --start")
+        assert tally.doubt() == (words and f"{words}; give --box, or --start near the pose")
 
 
 def test_follow_says_that_it_is_not_sure(follow, monkeypatch, capsys):
@@ -290,6 +292,23 @@ def test_follow_refines_the_start(frames, follow, tmp_path):
     start = ["--start", tmp_path / "start.txt"]
     assert follow(*start, source="turn.avi", box=False, out="out") == 0
     check_poses(tmp_path / "out", frames)
+
+
+@pytest.mark.parametrize(("confidence", "starts"), [(0.19, 0), (0.21, 1), (None, 1)])
+def test_a_start_that_is_no_match_is_not_followed(monkeypatch, confidence, starts):
+    """Pipelines without calibration do not tell."""
+    found = replace(registration(), probabilities=() if confidence is None else (confidence,))
+    monkeypatch.setattr(following, "refine", lambda *_, **__: [found])
+    follow = Mock()
+    assert following._started(follow, torch.zeros(3, 4, 4), PoseRecord(np.eye(4))) is found
+    assert follow.start.call_count == starts
+
+
+def test_without_calibration_followed_poses_have_no_confidence(follow, tmp_path, monkeypatch):
+    monkeypatch.setattr(following, "is_calibrated", lambda _: False)
+    assert follow(source="turn.avi", start=True) == 0
+    rows = table(tmp_path)
+    assert [(row["verdict"], row["confidence"]) for row in rows] == [("unsure", "")] * 3
 
 
 def test_a_start_without_a_camera_ends_the_run_at_once(follow, capsys):

@@ -259,6 +259,16 @@ def test_a_doubtful_pose_is_kept_above_a_limit_and_below_one_that_is_registered_
     assert not result.ok or result.confidence == pytest.approx(expected)
 
 
+def test_a_refined_pose_of_no_confidence_is_not_followed(monkeypatch):
+    """It would bound all later ones, so that no frame were registered again."""
+    image, box, T = sequence(2)[1]
+    follow = follower()
+    monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 0.1)
+    monkeypatch.setattr(tracking, "refine_one", lambda *_: answer(T @ HALF_TURN, 0.19))
+    answering(monkeypatch, answer(T, 0.95))
+    assert follow(image, box).confidence == 0.95
+
+
 @pytest.mark.slow
 def test_follower_loses_an_absent_object_and_finds_it_again():
     frames = sequence(2)

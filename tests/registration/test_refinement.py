@@ -94,12 +94,16 @@ def test_refine_refuses_wrong_arguments_and_a_start_that_does_not_show_the_mesh(
             _ = result.rotation
     for poses, camera, message in (
         ([torch.eye(4)], None, "camera matrix"),
-        ([torch.eye(4)] * 2, CAMERA, "starts of 1 photographs, got 2"),
+        ([torch.eye(4)] * 2, CAMERA, "poses: expected 1, one for each image or None, got 2"),
+        (None, CAMERA, "poses: expected 1, .* got NoneType"),
+        ([torch.zeros(0, 4, 4)], CAMERA, "poses: no start; give one"),
         ([2 * torch.eye(4)], CAMERA, "poses"),
         ([torch.eye(3)], CAMERA, "poses"),
     ):
         with refused(message):
             truck_registrar().refine([scene(0)[0]], camera, poses)
+    with refused("start_confidences: expected 1, .* got float"):
+        refinement.refine(truck_registrar(), [image], CAMERA, [T], start_confidences=0.5)
 
 
 @pytest.mark.parametrize(("confidence", "ok"), [(0.34, False), (0.36, True)])

@@ -224,6 +224,15 @@ def test_covariance_grows_where_photographs_contradict_each_other(easy):
     assert spread[1] > 2 * spread[0]
 
 
+def test_photographs_of_two_places_are_not_believed_unless_most_show_one():
+    images, boxes, cameras = rig_of(EASY)
+    cameras[0, 0, 3] += 0.4 * cameras[0, 2, 3]
+    assert registered(images[:2], boxes[:2], cameras[:2]).confidence < 0.5
+    most = registered(images, boxes, cameras)
+    assert most.views[0].failure is not None
+    assert most.confidence > 0.9
+
+
 @pytest.mark.slow
 def test_a_motion_of_the_world_moves_the_answer(easy):
     images, boxes, cameras = rig_of(EASY)
@@ -264,7 +273,7 @@ def test_copies_of_a_photograph_are_no_evidence():
     assert thrice.probabilities == pytest.approx(once.probabilities)
     assert torch.equal(thrice.transform, once.transform)
     assert torch.equal(thrice.hypotheses[0].covariance, once.hypotheses[0].covariance)
-    copy = "a copy of image 0, which counts once"
+    copy = "a copy of an earlier photograph, which counts once"
     assert [view.failure for view in thrice.views] == [None, copy, copy]
 
 
