@@ -41,7 +41,8 @@ PROTOCOL = (
     "cad=annotated|any|other: the annotated CAD model, the best of the class, or another one of "
     "it (seed=N); pose=upright|any: whether objects are known to stand upright; "
     "box=annotated|none|FRACTION: as annotated; detected; or each edge moved by up to FRACTION of "
-    "the side (seed=N); hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within "
+    "the side (seed=N); box_is=whole|visible: boxes of whole objects, or of their visible parts "
+    "(bop); hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within "
     "DEG of a value that is off by up to DEG; views=N: N photographs of one pose together (bop; "
     "seed=N)"
 )

@@ -20,7 +20,7 @@ def add_follow(commands: Any) -> None:
         "curvireg follow 0 part.stl --unit mm --camera cam.yaml --json",
         help="follow an object through a video, or live",
         description="Registers the first frame and tracks the object from frame to frame. Writes\n"
-        "DIR/results.csv: photo, verdict (reliable, unsure, no match, lost, "
+        "DIR/results.csv: photo, verdict (reliable, reliable axis, unsure, no match, lost, "
         "failed),\nrotation row by row, "
         "translation in the mesh's unit, confidence, edge support, and why there is no pose;\n"
         "DIR/overlay.mp4: contours of the pose and confidence on each frame.\n"

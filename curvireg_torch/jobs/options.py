@@ -237,7 +237,8 @@ class RegisterOptions:
     )
     up: str | None = _option(
         None,
-        "axis of the mesh file that points up, as --up=-y; default: y for glTF, else z",
+        "axis of the mesh file that points up, as --up=-y; default: that which the file states "
+        "(Collada, USD), y for glTF, else z",
         choices=UP_AXES,
     )
     mesh_is: str | None = _option(

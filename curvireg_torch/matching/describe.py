@@ -50,8 +50,8 @@ def hog_layer(settings: BankSettings) -> HOG:
 
 @measure
 def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """What framed views of a mesh of more than ``VIEW_FACES`` faces are rendered from, with no more
-    than these."""
+    """What framed views of a mesh of more than ``VIEW_FACES`` faces are rendered from, see
+    :func:`.simplified`."""
     centre = mesh_centre(mesh).numpy()
     vertices, faces = simplified(mesh, centre, VIEW_FACES)
     return trimesh.Trimesh(vertices + centre, faces, process=False)
@@ -59,7 +59,7 @@ def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one clean mesh, see
-    :meth:`curvireg_torch.ViewBank.build`. Framed views are rendered from a mesh of at most
+    :meth:`curvireg_torch.ViewBank.build`. Framed views are rendered from a mesh of about
     ``VIEW_FACES`` faces, ``view_mesh``; ``renderer`` is one of the whole mesh.
 
     Example:
