@@ -33,7 +33,7 @@ STEPS = {
     "saliency": (2, 1, "their edges", "filters/curvilinear.py"),
     "bank": (3, 1, "descriptors", "matching/bank.py"),
     "photograph": (0, 0, "photograph", "data/images.py"),
-    "crop": (1, 0, "cut out", "data/crops.py"),
+    "crop": (1, 0, "cut out", "geometry/crops.py"),
     "field": (2, 0, "its edges", "features/fields.py"),
     "query": (3, 0, "descriptor", "features/hog.py"),
     "ranking": (4, 0.5, "ranking", "matching/matcher.py"),
