@@ -78,6 +78,9 @@ class FakeRig:
     def angles(self, poses, _):
         return poses[:, 0, 0]
 
+    def centres(self, poses):
+        return poses[:, :3, 3]
+
     def hypothesis(self, _, m, mean):
         return SimpleNamespace(number=m, similarity=float(mean.similarity[m]))
 

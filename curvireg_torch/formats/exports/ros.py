@@ -75,7 +75,7 @@ def write_ros(
         "tf.yaml": {"transforms": [transform]},
     }
     if document["covariance"] is not None:
-        rows = ros_covariance(document["covariance"], metres)
+        rows = _ros_covariance(document["covariance"], metres)
         covariance = [number for row in rows for number in row]
         message = {"header": header, "pose": {"pose": pose, "covariance": covariance}}
         contents["pose_with_covariance.yaml"] = message
@@ -84,7 +84,7 @@ def write_ros(
         write_file(out / name, text.encode())
 
 
-def ros_covariance(covariance: Sequence[Sequence[float]], metres: float) -> list[list[float]]:
+def _ros_covariance(covariance: Sequence[Sequence[float]], metres: float) -> list[list[float]]:
     """6 x 6 numbers in the order of ROS, position before rotation, in m and rad, of 6 x 6 in that
     of ``result.json``, whose unit of length has so many ``metres``. Both are about the fixed axes
     of the frame, through the object's origin.
@@ -92,7 +92,7 @@ def ros_covariance(covariance: Sequence[Sequence[float]], metres: float) -> list
     Example:
         >>> ours = [[1.0 if i == j == 0 else 0.0 for j in range(6)] for i in range(6)]
         >>> ours[0][3] = ours[3][0] = 200.0
-        >>> [row[3] for row in ros_covariance(ours, 0.001)]
+        >>> [row[3] for row in _ros_covariance(ours, 0.001)]
         [0.2, 0.0, 0.0, 1.0, 0.0, 0.0]
     """
     scale = (1.0, 1.0, 1.0, metres, metres, metres)
