@@ -143,6 +143,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight,
     monkeypatch.setattr(type(registrar.matcher), "rank", lambda *_: lowered)
     (result,) = stages.register(registrar, [item], query)
     assert (float(degrees_off(result, TRUTH)) < 4) == right
+    assert len(result.hypotheses) == registrar.pipeline.hypotheses
 
 
 def test_views_have_one_short_fit_and_three_are_fitted_even_if_one_is_reported(monkeypatch):
