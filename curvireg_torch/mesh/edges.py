@@ -151,6 +151,8 @@ def _collapsed(vertices: Floats, faces: Integers, max_faces: int) -> tuple[Float
 
 def _has_lost_parts(vertices: Floats, faces: Integers, points: Floats, triangles: Integers) -> bool:
     """Whether a simplified surface has nothing near a part of the whole one."""
+    if not len(triangles):
+        return True
     whole = surface_points(trimesh.Trimesh(vertices, faces, process=False), LOST_POINTS)
     left = surface_points(trimesh.Trimesh(points, triangles, process=False), KEPT_POINTS, seed=1)
     tolerance = LOST_DISTANCE * np.abs(vertices).max()

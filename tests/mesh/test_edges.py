@@ -1,5 +1,6 @@
 """Creases, smooth edges and the simplification of a mesh."""
 
+import fast_simplification
 import numpy as np
 import pytest
 import torch
@@ -112,3 +113,13 @@ def test_no_part_of_a_fine_mesh_is_lost_whatever_its_unit(faces, radius):
     found = cKDTree(surface_points(trimesh.Trimesh(vertices, triangles, process=False), 20_000))
     distance, _ = found.query(surface_points(mesh, 2_000, seed=1))
     assert distance.max() < 0.06 * radius
+
+
+def test_a_mesh_of_which_nothing_is_left_is_simplified_again(monkeypatch):
+    nothing = np.eye(3, dtype=np.float32), np.zeros((0, 3), np.int32)
+    answers = iter([lambda *_, **__: nothing, fast_simplification.simplify])
+    monkeypatch.setattr(
+        fast_simplification, "simplify", lambda *mesh, **how: next(answers)(*mesh, **how)
+    )
+    _, triangles = simplified(trimesh.creation.icosphere(3), np.zeros(3), 800)
+    assert 700 < len(triangles) <= 800
