@@ -185,6 +185,7 @@ def _poses(
     took."""
     follow = None
     prior = prior_from_limits(options.limits)
+    has_probabilities = is_calibrated(registrar.pipeline)
     is_first = True
     for name, photo in frames:
         begun = time.perf_counter()
@@ -207,7 +208,7 @@ def _poses(
                 follow = Follower(registrar, _camera(options, photo), prior=prior)
                 start = options.read_start()
             result = follow(image, box) if start is None else _started(follow, image, start)
-            if isinstance(result, Registration) and not is_calibrated(registrar.pipeline):
+            if isinstance(result, Registration) and not has_probabilities:
                 result = replace(result, probabilities=())
         except CurviregError as error:
             if follow is None and options.boxes is None:

@@ -50,7 +50,8 @@ def register_views(
     photographs at once, and ordered by the sum of their scores. One photograph lowers a pose by at
     most five points, and those from nearly the same side share one vote; a copy, from the same
     place, counts for nothing. A photograph that does not show the best pose is left out, and the
-    others decide again.
+    others decide again. If it is sure of another rotation, that lowers the confidence; so does
+    another place, unless most photographs show the pose.
 
     Args:
         target: the object, a :class:`.Registrar`.
