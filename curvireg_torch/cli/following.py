@@ -231,6 +231,7 @@ def _started(
         confidence = found.confidence
         if confidence is None:  # pipelines without calibration
             confidence = 1.0 if start.confidence is None else start.confidence
+        confidence = min(confidence, found.confidence_bound)
         if confidence >= KEPT_CONFIDENCE:
             follow.start(image, known, confidence=confidence)
     return found

@@ -118,7 +118,8 @@ def refine(
     within about 15 degrees and 15 % of the distance of the truth. A fit from a wrong start may look
     as good as one from a good start, so the photograph is also registered in the box of the refined
     pose: the confidence is the smaller one of that of the fit and of the probability that the
-    registration gives the pose, and never more than that of the start.
+    registration gives the pose, and never more than that of the start. What that registration warns
+    of, such as another focal length than the camera's, holds for the refined pose too.
 
     Args:
         target: the object, a :class:`.Registrar`.
@@ -215,17 +216,23 @@ def refine_one(
             f"the object is not near the start (edge support {features['edge_support']:.2f}, "
             f"similarity {features['similarity']:.2f}); give another start, or register it again"
         )
+    warnings = item.warnings + target.mesh_warnings
     probabilities: tuple[float, ...] = ()
     if is_calibrated(target.pipeline):
-        registered = _registered_probability(target, item, poses[best])
-        probability = min(confidence, registered, 1.0 if limit is None else limit)
+        registered = _registered(target, item, poses[best])
+        probability = min(
+            confidence,
+            _probability_near(target, registered, poses.rotation[best[0]]),
+            1.0 if limit is None else limit,
+        )
         probabilities = (probability, *[0.0] * (len(hypotheses) - 1))
+        warnings = registered.warnings
     return Registration(
         hypotheses,
         probabilities,
         Ranking.none(),
         dict(features),
-        warnings=item.warnings + target.mesh_warnings,
+        warnings=warnings,
         notes=target.mesh_notes,
         camera=item.pinhole,
         reliable_from=settings.reliable,
@@ -283,13 +290,18 @@ def _fitted(
     return poses if fitted is None else poses.replaced(best, fitted)
 
 
-def _registered_probability(target: Target, item: Photograph, pose: Hypotheses) -> float:
-    """Probability of one pose, that of the hypotheses within 30 degrees of it, in a registration of
-    the box that it projects to, which its rotation does not influence."""
+def _registered(target: Target, item: Photograph, pose: Hypotheses) -> Registration:
+    """A registration of the box that a pose projects to, which its rotation does not influence."""
     boxes, _ = boxes_at(target.describer.hull, pose.T, pose.cameras, item.size)
     query = target.matcher.query([item.image], boxes.float())
     item = replace(item, box=boxes[0].float())
-    (found,) = register(target.with_hypotheses(COMPARED), [item], query)
-    rotations = torch.stack([hypothesis.allocentric_rotation for hypothesis in found.hypotheses])
-    near = are_near(rotations, pose.rotation[0], target.symmetries_of(exact=target.is_exact))
-    return sum(p for p, is_near in zip(found.probabilities, near.tolist(), strict=True) if is_near)
+    return register(target.with_hypotheses(COMPARED), [item], query)[0]
+
+
+def _probability_near(target: Target, registered: Registration, rotation: Tensor) -> float:
+    """Probability of a pose with this ``rotation`` (3, 3) in a registration: that of the hypotheses
+    within 30 degrees of it."""
+    rotations = [hypothesis.allocentric_rotation for hypothesis in registered.hypotheses]
+    near = are_near(torch.stack(rotations), rotation, target.symmetries_of(exact=target.is_exact))
+    pairs = zip(registered.probabilities, near.tolist(), strict=True)
+    return min(sum(p for p, is_near in pairs if is_near), registered.confidence_bound)

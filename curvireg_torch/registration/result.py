@@ -357,6 +357,14 @@ class Registration:
         return (self.confidence_features.get("undetermined") or 0.0) < MOST_UNDETERMINED
 
     @property
+    def confidence_bound(self) -> float:
+        """Most confidence of poses that follow from this one: 1, or less than of a reliable answer
+        if this one is not for another reason than its confidence."""
+        if self.reliable or self.is_doubtful:
+            return 1.0
+        return math.nextafter(self.reliable_from, 0.0)
+
+    @property
     def _likely_meshes(self) -> list[int]:
         """The numbers of this mesh and of others that are nearly as probable, if there are any."""
         every = self.mesh_probabilities

@@ -2,7 +2,7 @@
 edges; and following an object through the frames of a video."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -336,7 +336,8 @@ class Follower:
 
     The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and
     10 % of the distance of the truth: the tracker's own, times that of the last pose that a
-    registration confirmed. No pose gains confidence from being followed, unless a further
+    registration confirmed, less than of a reliable one if the registration was not; its warnings
+    hold for the frames that follow. No pose gains confidence from being followed, unless a further
     registration is reliable.
 
     Args:
@@ -380,6 +381,8 @@ class Follower:
         self._tracker = Tracker(describer.contours, describer.hull, reliable=self._reliable)
         # confidence of the pose that tracking goes on from, if there is one
         self._base: float | None = None
+        # and the warnings of the registration that confirmed it
+        self._warnings: tuple[str, ...] = ()
         # registrations in a row that agree, none of which is believed
         self._agreeing: list[Tensor] = []
 
@@ -433,9 +436,12 @@ class Follower:
                 self.camera_matrix = replace(camera, size=item.size)
         return item
 
-    def _start(self, item: Photograph, T: Tensor, confidence: float) -> None:
+    def _start(
+        self, item: Photograph, T: Tensor, confidence: float, warnings: Sequence[str] = ()
+    ) -> None:
         self._tracker.start(item.image, item.K, T)
         self._base = confidence
+        self._warnings = tuple(warnings)
 
     @torch.no_grad()
     def __call__(
@@ -479,6 +485,7 @@ class Follower:
                     self._tracker.measure(item.image, item.K, refined.projection[0])
                 )
                 self._base = _confidence(refined)
+                self._warnings = refined.warnings
             return refined
         if tracked and found and _confidence(found) >= KEPT_CONFIDENCE:
             self._tracker.accept(tracked)
@@ -503,7 +510,8 @@ class Follower:
         ):
             pose, K = result.projection
             with suppress(LostObjectError, ImageError):
-                self._start(item.by(K), pose, _confidence(result))
+                confidence = min(_confidence(result), result.confidence_bound)
+                self._start(item.by(K), pose, confidence, result.warnings)
                 if self._fits_camera:
                     self.camera_matrix = result.camera
         return result
@@ -532,8 +540,13 @@ class Follower:
         except CurviregError as error:
             return FailedRegistration(error)
         assert self._base is not None
-        bound = 1.0 if _confidence(result) >= self._reliable else self._base
-        return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
+        bound = 1.0
+        warnings = result.warnings
+        if _confidence(result) < self._reliable:
+            bound = self._base
+            warnings = _each_once(warnings + self._warnings)
+        probabilities = tuple(min(p, bound) for p in result.probabilities)
+        return replace(result, probabilities=probabilities, warnings=warnings)
 
     def _registration(self, tracked: TrackedPose, item: Photograph) -> Registration:
         """The result of a tracked pose, without ranking and without rivals."""
@@ -550,7 +563,7 @@ class Follower:
         hypothesis = hypothesis_of(poses, 0, tracked.features, score="region")
         assert self._base is not None
         probabilities = (self._base * tracked.confidence,)
-        warnings = item.warnings + self.registrar.mesh_warnings
+        warnings = item.warnings + self.registrar.mesh_warnings + self._warnings
         notes = self.registrar.mesh_notes
         features = dict(tracked.features)
         ranking = Ranking.none()
@@ -559,11 +572,15 @@ class Follower:
             probabilities,
             ranking,
             features,
-            warnings=warnings,
+            warnings=_each_once(warnings),
             notes=notes,
             camera=item.pinhole,
             reliable_from=self._reliable,
         )
+
+
+def _each_once(texts: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(texts))
 
 
 def _confidence(result: Registration) -> float:

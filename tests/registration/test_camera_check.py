@@ -13,7 +13,8 @@ from kornia.geometry.transform import resize
 
 from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.least_squares import PointMatches, pixels
-from curvireg_torch.geometry import camera_matrix
+from curvireg_torch.geometry import camera_matrix, rotation_error
+from curvireg_torch.registration import Follower
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.camera import focal_contradiction, stretch_contradiction
 from curvireg_torch.registration.hypotheses import Hypotheses
@@ -74,6 +75,18 @@ def test_a_focal_length_that_the_photograph_contradicts_is_named_and_not_reliabl
     assert "shows a focal length of about" in result.warnings[-1]
     shown = float(result.warnings[-1].split("about ")[1].split(" px")[0])
     assert shown == pytest.approx(FOCAL, rel=0.05)
+
+
+def test_a_contradicted_camera_is_named_in_refined_poses_and_in_frames_that_follow():
+    image, box = near_photograph()
+    result, _ = registered(0.7)
+    refined = learned_registrar().refine([image], camera(0.7), [result.projection[0]])[0]
+    follow = Follower(learned_registrar(), camera(0.7))
+    frames = [follow(image, box), follow(image), follow(image)]
+    for one in (refined, *frames):
+        assert rotation_error(one.rotation, result.rotation) < 1.0
+        assert one.warnings == result.warnings
+        assert not one.reliable
 
 
 @cache

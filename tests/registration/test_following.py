@@ -259,6 +259,18 @@ def test_a_doubtful_pose_is_kept_above_a_limit_and_below_one_that_is_registered_
     assert not result.ok or result.confidence == pytest.approx(expected)
 
 
+def test_frames_after_an_answer_that_is_questioned_are_not_reliable_either(monkeypatch):
+    (image, box, T), (second, _, _) = sequence(2)
+    monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 1.0)
+    found = []
+    for contradiction in (None, "better outside"):
+        follow = Follower(truck_registrar(), CAMERA)
+        answering(monkeypatch, replace(answer(T, 0.95), prior_contradiction=contradiction))
+        follow(image, box)
+        found.append(follow(second).verdict)
+    assert found == ["reliable", "unsure"]
+
+
 def test_a_refined_pose_of_no_confidence_is_not_followed(monkeypatch):
     """It would bound all later ones, so that no frame were registered again."""
     image, box, T = sequence(2)[1]

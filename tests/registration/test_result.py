@@ -151,6 +151,8 @@ def test_a_rotation_that_is_not_determined_is_not_reliable():
             judged = replace(result, confidence_features={"undetermined": undetermined})
             assert judged.reliable == (verdict == "reliable")
             assert judged.verdict == verdict
+            assert (judged.confidence_bound < judged.reliable_from) == (not judged.reliable)
+    assert registration(confidence=0.5).confidence_bound == 1.0, "its own confidence is a bound"
 
 
 def test_results_are_equal_to_themselves_alone():
