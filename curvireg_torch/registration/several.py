@@ -1,6 +1,8 @@
 """One pose from several photographs: each is registered alone, then candidates are compared in all
 of them."""
 
+import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -51,7 +53,8 @@ def register_views(
     most five points, and those from nearly the same side share one vote; a copy, from the same
     place, counts for nothing. A photograph that does not show the best pose is left out, and the
     others decide again. If it is sure of another rotation, that lowers the confidence; so does
-    another place, unless most photographs show the pose.
+    another place, unless most photographs show the pose. What more than half of the photographs warn
+    of holds for the joint pose.
 
     Args:
         target: the object, a :class:`.Registrar`.
@@ -231,13 +234,21 @@ def _registration(
         probabilities=probabilities[:count],
         ranking=first.result.ranking,
         confidence_features=features,
-        warnings=tuple(
-            sorted(set.intersection(*(set(p.result.warnings) for p in rig.photographs)))
-        ),
+        warnings=_warnings_of_most([p.result for p in rig.photographs]),
         notes=first.result.notes,
         views=tuple(views),
         reliable_from=target.pipeline.fit.reliable,
     )
+
+
+def _warnings_of_most(results: Sequence[Registration]) -> tuple[str, ...]:
+    """What more than half of the results warn of, as the first of them says it: a focal length that
+    each photograph contradicts is another number in each."""
+    kinds = defaultdict(list)
+    for result in results:
+        for text in result.warnings:
+            kinds[re.sub(r"\d+", "", text)].append(text)
+    return tuple(sorted(texts[0] for texts in kinds.values() if 2 * len(texts) > len(results)))
 
 
 def _joint_probabilities(

@@ -165,11 +165,11 @@ def test_failed_photographs_say_why_and_do_not_count(monkeypatch):
     assert result.probabilities == pytest.approx(TOGETHER)
 
 
-def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
+def test_doubts_are_means_by_votes_and_warnings_those_of_most(monkeypatch):
     """The fraction outside is a thousandth of the height here."""
-    first = photograph(0, ranking_share=0.2, warnings=("b", "a", "own"))
-    second = photograph(1, ranking_share=None, warnings=("a", "b"))
-    third = photograph(2, ranking_share=0.6, warnings=("b", "x", "a"))
+    first = photograph(0, ranking_share=0.2, warnings=("b 400", "a", "own"))
+    second = photograph(1, ranking_share=None, warnings=("a", "b 405"))
+    third = photograph(2, ranking_share=0.6, warnings=("x", "a"))
     second.photograph.size = (300, 200)
     second.photograph.box = torch.tensor([-0.5, 10.0, 199.5, 50.0])
     second.printed = lambda _: 3.5
@@ -182,7 +182,8 @@ def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
     assert features["border"] == pytest.approx(0.5 * 2)
     assert features["undetermined"] == 3.0
     assert features["unmatched"] == pytest.approx(3.5 - features["keypoints"])
-    assert result.warnings == ("a", "b")
+    assert result.warnings == ("a", "b 400")
+    assert joint(monkeypatch, {0: first, 1: third}, scores).warnings == ("a",), "not of one of two"
 
 
 @pytest.mark.parametrize("away", [0.0, 0.01, 100.0])
