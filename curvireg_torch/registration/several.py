@@ -53,8 +53,8 @@ def register_views(
     most five points, and those from nearly the same side share one vote; a copy, from the same
     place, counts for nothing. A photograph that does not show the best pose is left out, and the
     others decide again. If it is sure of another rotation, that lowers the confidence; so does
-    another place, unless most photographs show the pose. What more than half of the photographs warn
-    of holds for the joint pose.
+    another place, unless most photographs show the pose. What more than half of the photographs
+    warn of holds for the joint pose.
 
     Args:
         target: the object, a :class:`.Registrar`.

@@ -9,6 +9,7 @@ import cv2
 import pytest
 import torch
 import trimesh
+from torch.nn.functional import max_pool2d
 
 from curvireg_torch import (
     ImageGradient,
@@ -32,8 +33,8 @@ from curvireg_torch.registration import (
     stages,
 )
 from curvireg_torch.registration import photograph as photograph_module
-from curvireg_torch.registration.photograph import Photograph, check_crop
-from curvireg_torch.rendering import make_renderer
+from curvireg_torch.registration.photograph import Photograph, as_photograph, check_crop
+from curvireg_torch.rendering import make_renderer, render_depth
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support import (
     CAMERA,
@@ -288,6 +289,28 @@ def registered_in_boxes(monkeypatch, *results, box=WRONG):
 
     monkeypatch.setattr(stages, "register_boxes", register_boxes)
     return answer_of(truck_registrar(box_jitter=0.1), IMAGE, box), boxes
+
+
+@pytest.mark.parametrize(
+    ("changed", "is_beside"),
+    [
+        (lambda mask: mask, False),
+        (lambda mask: mask & (torch.arange(mask.shape[1]) < BOX[[0, 2]].mean()), False),
+        (lambda mask: max_pool2d(mask[None].float(), 5, 1, 2)[0] > 0, False),
+        (lambda mask: max_pool2d(mask[None].float(), 21, 1, 10)[0] > 0, True),
+        (lambda mask: mask.roll(int(0.25 * (BOX[2] - BOX[0])), 1), True),
+        (lambda mask: mask.roll(int(0.25 * (BOX[3] - BOX[1])), 0), True),
+    ],
+)
+def test_a_pose_beside_its_mask_is_not_believed(monkeypatch, changed, is_beside):
+    """A part of the object, and a mask that reaches a little beyond it, are none."""
+    sure = replace(truck_answer(), probabilities=(1.0,))
+    mask = changed(render_depth(example_mesh(), TRUTH, CAMERA, SIZE)[0, 0] > 0)
+    monkeypatch.setattr(stages, "register_boxes", lambda _, items: [sure] * len(items))
+    item = as_photograph(IMAGE, BOX, CAMERA, mask=mask)
+    (result,) = stages.register_photographs(truck_registrar(), [item])
+    assert (stages.BESIDE_MASK in result.warnings) == is_beside
+    assert result.reliable != is_beside
 
 
 @pytest.mark.parametrize(
