@@ -83,7 +83,10 @@ YOLO = """
 0 0.25 0.5 0.5 0.25 0.75 0.75                    | 1.0  |     | a triangle
 0 0.25 0.25 0.75 0.25 0.75 0.75 0.25 0.75        | 1.0  |     | an oriented box
 0 0.5 0.25 0.75 0.5 0.5 0.75 0.25 0.5 0.25       | 0.25 |     | with its score
+0 0.25 0.25 0.75 0.25 0.75 0.75 0.25 0.75 7      | 1.0  | "7" | with its number of a tracker
+0 0.5 0.25 0.75 0.5 0.5 0.75 0.25 0.5 0.25 1     | 0.25 | "1" | with both
 0 0.25 0.5 0.5 0.25 0.75 0.5 0.6 0.75 0.4 0.75   | 1.0  |     | a polygon
+0 0.25 0.5 0.5 0.25 0.75 0.5 0.6 0.75 0.4 0.75 2 | 1.0  | "2" | with its number of a tracker
 """
 
 
@@ -104,6 +107,7 @@ NO_YOLO = """
 0 0.5 0.5 0.5 nan       | line 1: expected CLASS CX CY WIDTH HEIGHT
 0 0.5 0.5 0.5 0.5 1.5   | a score of 1.5, above 1
 0 0.5 0.5 0.5 0.5 1.5 3 | a score of 1.5, above 1
+0 .5 .1 .9 .5 .5 .9 1.5 | a score of 1.5, above 1
 """
 
 

@@ -96,8 +96,8 @@ def _refused(what: str) -> InvalidInputError:
 
 
 def _yolo(text: str) -> Iterator[ImageBox]:
-    """Lines of CLASS and numbers: a box with perhaps a score and a tracker's number, an oriented
-    box, or a polygon."""
+    """Lines of CLASS and numbers: a box, an oriented box or a polygon, behind which a score and a
+    tracker's number may stand."""
     for count, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words:
@@ -120,18 +120,18 @@ def _yolo_box(numbers: Sequence[float]) -> ImageBox | None:
         return None
     x, y, width, height, *more = numbers
     corners = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
-    ends_with_track = count in (5, 6) and numbers[-1] >= 1.0 and numbers[-1] == int(numbers[-1])
+    is_whole = numbers[-1] >= 1.0 and numbers[-1] == int(numbers[-1])
     # else the corners of a triangle, the last of which lies on the border
-    is_box = min(corners) > -BEYOND and max(corners) < 1.0 + BEYOND
-    if count in (4, 5) or (count == 6 and ends_with_track and is_box):
-        track = str(int(more.pop())) if ends_with_track else ""
-        score = more[0] if more else 1.0
-        if score > 1.0:
-            raise _refused(f"a score of {score:g}, above 1")
-        return ImageBox(corners, True, score=score, track=track)
-    # of an oriented box or a polygon, behind which a score may stand
-    score = numbers[-1] if count % 2 else 1.0
-    return ImageBox(_around(numbers[: count - count % 2]), True, score=score)
+    is_inside = min(corners) > -BEYOND and max(corners) < 1.0 + BEYOND
+    is_box = count < 6 or (count == 6 and is_whole and is_inside)
+    has_track = is_whole and (count > 8 or (is_box and count > 4))
+    ending = more if is_box else list(numbers)
+    track = str(int(ending.pop())) if has_track else ""
+    has_score = len(ending) % 2
+    score = ending.pop() if has_score else 1.0
+    if score > 1.0:
+        raise _refused(f"a score of {score:g}, above 1")
+    return ImageBox(corners if is_box else _around(ending), True, score=score, track=track)
 
 
 def _around(numbers: Sequence[float]) -> Corners:
