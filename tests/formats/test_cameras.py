@@ -118,11 +118,10 @@ def test_opencv_with_other_keys(tmp_path, read):
     file = tmp_path / "fisheye.yml"
     store(file, cameraMatrix=K, distCoeffs=np.array(LENS[:4]), fisheye_model=1)
     check(load_camera(file), LENS[:4], model="fisheye", size=None)
-    check(
-        read(file.read_text().replace("fisheye_model: 1", "fisheye_model: 0"), "fisheye.yml"),
-        LENS[:4],
-        size=None,
-    )
+    text = file.read_text()
+    for flag in ("0", "no", "Off", "false", '"0"'):
+        other = text.replace("fisheye_model: 1", f"fisheye_model: {flag}")
+        check(read(other, "fisheye.yml"), LENS[:4], size=None)
 
 
 @pytest.mark.parametrize(

@@ -68,6 +68,8 @@ OTHER_MODEL_NAMES = _names("model lens_model lens_type camera_type projection pr
 """Keys that may also name a product, such as "Logitech C920", which is no model."""
 
 FISHEYE_FLAGS = _names("fisheye_model is_fisheye fisheye")
+FLAGS = dict.fromkeys(_names("1 1.0 true yes on"), True)
+FLAGS |= dict.fromkeys(_names("0 0.0 false no off"), False)
 
 PERSPECTIVE_MODELS = _names("""
     none pinhole simplepinhole perspective frame plumbbob radtan radialtangential brown brownconrady
@@ -185,8 +187,11 @@ def _read_matrix(record: Record) -> list[float]:
 
 def _read_model(record: Record) -> str | None:
     """OpenCV's model, or None if the record names none."""
-    flags = record.get(*FISHEYE_FLAGS)
-    if flags is not None and flags not in (0, False):
+    flag = record.get(*FISHEYE_FLAGS)
+    is_fisheye = FLAGS.get(str(flag).lower())
+    if flag is not None and is_fisheye is None:
+        raise InvalidInputError(f"{FISHEYE_FLAGS[-1]}: expected yes or no, got {flag!r:.40}")
+    if is_fisheye:
         return FISHEYE
     named = [_model_of(text) for text in record.words(*MODEL_NAMES) if text]
     for text in _other_models(record):
