@@ -191,7 +191,12 @@ FOREIGN = r"""
 {"k": [0, 0, 0, 0, 0, 0, 0, 0, 0], "d": [], "width": 640, "height": 480} | a camera that is not calibrated
 {"fx": 520.5, "fy": 522.0}                                           | got 2 of these; add cx, cy, in px
 {"projection_type": "spherical", "focal": 0.8, "width": 640, "height": 480} | 'spherical' is not supported; choose from perspective, brown
+{"projection_type": ["brown"], "focal": 0.8}                         | not supported; choose from perspective, brown
 {"projection_type": "brown", "focal_x": 0.8}                         | no width, height
+{"colmap": 5}                                                        | expected CAMERA_ID MODEL
+{"lens": 50.0, "sensor_width": 36.0}                                 | no camera matrix
+{"SensorWidth": 4096, "Intrinsics": {"ModelParameters": [0.5]}}      | no camera matrix
+{"K": [520, 522, 321, 238], "fisheye": "perhaps"}                    | fisheye: expected yes or no, got 'perhaps'
 """  # noqa: E501
 
 

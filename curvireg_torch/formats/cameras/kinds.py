@@ -204,7 +204,7 @@ def _read_model(record: Record) -> str | None:
         elif name in MODELS or name.startswith(UNSUPPORTED):
             named.append(_model_of(text))
     if not named:
-        return None if flags is None else RADIAL_TANGENTIAL
+        return None if flag is None else RADIAL_TANGENTIAL
     return FISHEYE if FISHEYE in named else RADIAL_TANGENTIAL
 
 
@@ -436,7 +436,7 @@ OPENSFM = dict.fromkeys(
 def _opensfm(record: Record) -> CameraRecord:
     """Of OpenSfM and OpenDroneMap: lengths are fractions of the longer side, and count from the
     picture's centre."""
-    name = record.get("projection_type")
+    name = str(record.get("projection_type"))
     if name not in OPENSFM:
         raise _unsupported(name, ", ".join(OPENSFM))
     size = _checked_size(record.numbers(*WIDTH) + record.numbers(*HEIGHT))
@@ -474,8 +474,8 @@ COLMAP = {
 
 def _colmap(record: Record) -> CameraRecord:
     """A line of ``cameras.txt``: the corner of the picture is (0, 0)."""
-    words = record.values["colmap"]
-    line = f"line {record.values['line']}"
+    words = list(map(str, flattened(record.get("colmap"))))
+    line = f"line {record.get('line')}"
     focals, count, model = COLMAP.get(words[1] if len(words) > 1 else "", (0, 0, ""))
     if not focals or len(words) != 6 + focals + count:
         models = ", ".join(
@@ -546,7 +546,7 @@ FORMATS = (
         "1) / 2",
     ),
     _unread(
-        "pxFocalLength|sensorWidth",
+        "pxFocalLength|focalLength pxFocalLength|sensorWidth",
         "cameras of Meshroom; export them as COLMAP, or write fx = fy = width * focalLength / "
         "sensorWidth, cx = width / 2 + principalPoint[0] - 0.5 and cy = height / 2 + "
         "principalPoint[1] - 0.5",
