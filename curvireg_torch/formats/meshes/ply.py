@@ -134,7 +134,7 @@ class _Rows:
             stored = np.asarray(self.columns[names[0]]).dtype
             if stored.kind == "f":
                 return colour_bytes(values)
-            is_large = stored == np.uint16 and values.max(initial=0.0) > 255
+            is_large = (stored.kind, stored.itemsize) == ("u", 2) and values.max(initial=0.0) > 255
             factor = 255.0 / 65535.0 if is_large else 1.0
             return np.clip(np.nan_to_num(factor * values).round(), 0, 255).astype(np.uint8)
         return None

@@ -39,6 +39,17 @@ def test_colours_under_every_name(write, prefix, short, kind, scale):
     np.testing.assert_array_equal(mesh.colours.corners, np.array(SHADES)[mesh.faces])
 
 
+@pytest.mark.parametrize(("kind", "order"), [("little", "<"), ("big", ">")])
+def test_colours_of_16_bits_are_scaled_in_any_byte_order(write, kind, order):
+    text = header(RGB.replace("uchar", "ushort"), kind=f"binary_{kind}_endian")
+    shades = 257 * np.array(SHADES)
+    points = [(*point, *shade) for point, shade in zip(POINTS, shades, strict=True)]
+    vertices = np.array(points, np.dtype("f4,f4,f4,u2,u2,u2").newbyteorder(order))
+    faces = np.array([(3, 0, 1, 2), (3, 0, 2, 3)], np.dtype("u1,i4,i4,i4").newbyteorder(order))
+    mesh = cr.load_mesh(write("a.ply", text.encode() + vertices.tobytes() + faces.tobytes()))
+    np.testing.assert_array_equal(mesh.colours.corners, np.array(SHADES)[mesh.faces])
+
+
 def pictures(folder):
     for k in range(2):
         (folder / f"{k}.png").write_bytes(encoded(noise(k)))
