@@ -20,6 +20,7 @@ from .source import MeshSource, ReadMesh, colour_bytes, numbers, plain_text, spe
 
 CHUNK = 100_000  # Lines of faces that are read at once, which bounds the memory
 _NAMES = (b"usemtl", b"o", b"g", b"mtllib")
+_REMARK = re.compile(rb"(?:^|\s)#(?:\s.*)?$")  # "Material #27" of 3ds Max has none
 _NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 # Options of a texture in an MTL file, and how many words follow; 0: up to three numbers
 _MAP_OPTIONS = {b"-s": 0, b"-o": 0, b"-t": 0, b"-mm": 2}
@@ -109,7 +110,7 @@ def _lines_of(data: bytes) -> _Lines:
         elif key == b"vt":
             found.uv.append(rest)
         elif key in _NAMES:
-            found.note(key, (whole if key == b"mtllib" else rest).strip())
+            found.note(key, _REMARK.sub(b"", whole).strip())
     return found
 
 
@@ -234,7 +235,7 @@ def _materials(data: bytes) -> dict[bytes, _Material]:
     found: dict[bytes, _Material] = {}
     current = _Material()
     for line in data.split(b"\n"):
-        word, rest = [*line.split(None, 1), b"", b""][:2]
+        word, rest = [*_REMARK.sub(b"", line).split(None, 1), b"", b""][:2]
         key = word.lower()
         if key == b"newmtl":
             current = found.setdefault(rest.strip(), _Material())

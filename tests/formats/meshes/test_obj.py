@@ -70,6 +70,15 @@ def test_names_of_libraries_may_hold_blanks_and_lost_materials_are_named(write, 
     assert (colours.corners[6:] == 255).all()
 
 
+def test_names_may_hold_number_signs_and_remarks_stand_behind_them(write, load):
+    write("a.mtl", "newmtl Material #27 # red\nKd 1 0 0 # of the lid\n")
+    mesh, said = load(
+        write("a.obj", f"mtllib a.mtl # it\n{POINTS}usemtl Material #27\n{HALVES[0]}")
+    )
+    assert (mesh.colours.corners == [255, 0, 0]).all()
+    assert said == []
+
+
 def test_faces_of_a_textured_material_without_coordinates_are_named(write, load, tmp_path):
     picture(tmp_path / "label.png")
     write("a.mtl", "newmtl label\nmap_Kd label.png\n")
