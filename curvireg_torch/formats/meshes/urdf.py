@@ -129,20 +129,25 @@ class _Parts:
         return found
 
     def _mesh(self, visual: Any) -> ReadMesh | None:
-        """A mesh file, or a box, cylinder or sphere."""
+        """A mesh file, or a box, sphere, cylinder or capsule; None, with a warning, of others."""
         for shape in visual.findall("geometry/*"):
             if shape.tag == "mesh":
                 return self._file(shape)
             if shape.tag == "box":
                 size = fixed_numbers(shape.get("size", ""), 3)
                 return ReadMesh.of_surface(trimesh.creation.box(size))
+            if shape.tag not in ("sphere", "cylinder", "capsule"):
+                text = f"its shape {shape.tag[:50]} is not read and is left out"
+                self._source.warn("link", text)
+                continue
             (radius,) = fixed_numbers(shape.get("radius", ""), 1)
             if shape.tag == "sphere":
                 return ReadMesh.of_surface(trimesh.creation.icosphere(4, radius))
+            (length,) = fixed_numbers(shape.get("length", ""), 1)
             if shape.tag == "cylinder":
-                (length,) = fixed_numbers(shape.get("length", ""), 1)
                 cylinder = trimesh.creation.cylinder(radius, length, sections=64)
                 return ReadMesh.of_surface(cylinder)
+            return ReadMesh.of_surface(trimesh.creation.capsule(length, radius, count=(64, 64)))
         return None
 
     def _file(self, shape: Any) -> ReadMesh | None:

@@ -392,6 +392,14 @@ def test_urdf_names_meshes_that_it_does_not_find(tmp_path, load):
     assert mesh.bounds[0][0] == pytest.approx(-1.5)
 
 
+def test_urdf_reads_capsules_and_names_other_shapes(tmp_path, load):
+    capsule = '<geometry><capsule radius="0.5" length="2"/></geometry>'
+    torus = "<geometry><torus/></geometry>"
+    mesh, said = load(robot(tmp_path / "a.urdf", capsule, torus))
+    assert_allclose(mesh.extents, [1.0, 1.0, 3.0], atol=1e-6)
+    assert "its shape torus is not read and is left out" in said[0]
+
+
 PLACES = """
 arm_description/urdf   | true        | true
 arm_description/robots | true        | true
