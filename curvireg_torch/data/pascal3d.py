@@ -178,7 +178,9 @@ class Pascal3DPlus(ObjectDataset):
             return "corrupt_annotation"
         if name != category:
             return "other_class"
-        flags = {name: bool(_number(entry.get(name)) or 0) for name in self._excluded}
+        flags = {name: _flag(entry.get(name)) for name in self._excluded}
+        if None in flags.values():
+            return "corrupt_annotation"
         for name, excluded in self._excluded.items():
             if excluded and flags[name]:
                 return name
@@ -227,6 +229,15 @@ def _number(value: MatValue) -> float | None:
     """The first number of ``value`` if it is finite, else None."""
     first = value[0] if isinstance(value, list) and value else None
     return first if isinstance(first, float) and math.isfinite(first) else None
+
+
+def _flag(value: MatValue) -> bool | None:
+    """Whether a flag is set, as a number or a text of one; None for another text."""
+    if not isinstance(value, str):
+        return bool(_number(value))
+    with suppress(ValueError):
+        return bool(float(value or 0))
+    return None
 
 
 def _box(value: MatValue, origin: int) -> tuple[float, ...] | None:

@@ -119,6 +119,15 @@ def test_objects_without_a_class_are_corrupt(root):
     assert cars(root).skipped - before == {"corrupt_annotation": 1}
 
 
+def test_flags_may_be_texts(root):
+    record = root / "Annotations" / "car_pascal" / "2008_000001.mat"
+    before = cars(root).skipped
+    write_record(record, [pascal_object("car", occluded=flag) for flag in ("1", "0", "yes")])
+    dataset = cars(root)
+    assert [dataset.annotation(i)["occluded"] for i in range(2)] == [True, False]
+    assert dataset.skipped - before == {"corrupt_annotation": 1}
+
+
 def test_photographs_of_another_size_than_annotated_are_left_out(root):
     resized = root / "Images" / "car_pascal" / "2008_000002.jpg"
     write_image(resized, (30, 40))
