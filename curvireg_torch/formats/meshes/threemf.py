@@ -17,7 +17,7 @@ import numpy as np
 
 from ...errors import MAX_MESH_BYTES, MAX_MESH_FACES, MAX_MESH_PARTS
 from ...utils.arrays import Bytes, Floats
-from ..xml_files import check_xml
+from ..xml_files import check_xml, read_xml
 from .colours import SurfaceColours
 from .limits import check_corners, check_faces, check_parts
 from .source import MeshSource, ReadMesh, fixed_numbers
@@ -125,7 +125,14 @@ class _Package:
         self._meshes: dict[tuple[str, str], ReadMesh] = {}
 
     def root(self) -> str:
-        """The path of the model that the package starts with."""
+        """The path of the model that the package starts with: the one that it names, else by its
+        name."""
+        relations = "_rels/.rels"
+        if relations in self._names:
+            for one in read_xml(self._content(relations)):
+                target = one.get("Target", "")
+                if one.get("Type", "").endswith(f"/{_MODEL}") and self._has(target):
+                    return target
         models = [name for name in self._names if name.endswith(".model")]
         if not models:
             raise ValueError("no model in it")
@@ -229,6 +236,9 @@ class _Package:
                 return None
 
         return self._source.texture(path.lower(), read_content, path)
+
+    def _has(self, path: str) -> bool:
+        return path.lstrip("/").lower() in self._names
 
     def _content(self, path: str) -> bytes:
         name = self._names[path.lstrip("/").lower()]

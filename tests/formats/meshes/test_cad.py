@@ -320,6 +320,16 @@ def test_threemf_of_several_models(read_3mf):
     assert mesh.extents.tolist() == [30.0, 20.0, 10.0]
 
 
+def test_threemf_starts_with_the_model_that_it_names(read_3mf):
+    kind = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
+    relation = (
+        f'<Relationships><Relationship Target="/other/a.model" Type="{kind}"/></Relationships>'
+    )
+    more = {"_rels/.rels": relation, "other/a.model": model(solid(1, shape=SMALL))}
+    mesh, _ = read_3mf(solid(1), more=more)
+    assert mesh.extents.tolist() == [3.0, 2.0, 1.0]
+
+
 def test_hostile_threemf_files_are_refused(tmp_path, refused, bounded):
     path = tmp_path / "a.3mf"
     circle = '<object id="1"><components><component objectid="1"/></components></object>'
