@@ -26,14 +26,16 @@ from .colours import SurfaceColours, byte_colours
 from .limits import check_corners, check_faces, check_parts
 from .source import MeshSource, ReadMesh, fixed_numbers
 
-# Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or are
-# read here
+# Beginnings of glTF extensions that a file may require: they leave shape and colours alone, are
+# read here, or left out with a warning
 _READ_EXTENSIONS = (
     "KHR_materials_",
     "KHR_lights_",
     "KHR_animation_",
     "KHR_texture_transform",
     "KHR_mesh_quantization",
+    "KHR_texture_basisu",
+    "KHR_node_visibility",
     "EXT_texture_webp",
 )
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -47,6 +49,7 @@ _OTHER_VERSION = "only glTF version 2 is read; export version 2"
 _ENDS_EARLY = "the file ends too early, or is no GLB"
 _SPECULAR = "KHR_materials_pbrSpecularGlossiness"
 _TRANSFORM = "KHR_texture_transform"
+_VISIBILITY = "KHR_node_visibility"
 
 
 def read_gltf(source: MeshSource, data: bytes | None = None) -> ReadMesh:
@@ -172,6 +175,7 @@ class _File:
         self._buffers: dict[int, bytes] = {}
         self._parts: dict[int, list[tuple[Fields, ReadMesh]]] = {}
         self._skins: dict[int, Floats] = {}
+        self._hidden: set[int] = set()
         self._places = dict(self._nodes())
 
     def _item(self, kind: str, index: Any) -> Any:
@@ -183,7 +187,10 @@ class _File:
         found = []
         for index, place in self._places.items():
             node = self._tree["nodes"][index]
-            if "mesh" in node:
+            if "mesh" in node and index in self._hidden:
+                self._source.warn("parts", "its invisible parts are left out")
+            elif "mesh" in node:
+                self._name_targets(node)
                 found += [self._placed(node, place, *part) for part in self._mesh(node["mesh"])]
         return ReadMesh.joined(found)
 
@@ -230,15 +237,22 @@ class _File:
             node = self._tree["nodes"][index]
             place = above @ _local(node)
             yield index, place
+            visibility = node.get("extensions", {}).get(_VISIBILITY, {})
+            if index in self._hidden or not visibility.get("visible", True):
+                self._hidden.update((index, *node.get("children", [])))
             waiting += [(child, place) for child in reversed(node.get("children", []))]
+
+    def _name_targets(self, node: Fields) -> None:
+        """Warn of a node's morph targets, whose weights come before those of its mesh."""
+        mesh = self._item("meshes", node["mesh"])
+        if any(node.get("weights", mesh.get("weights", []))):
+            self._source.warn(
+                "skin", "its morph targets are left out: the shape is that without them"
+            )
 
     def _mesh(self, index: int) -> list[tuple[Fields, ReadMesh]]:
         if index not in self._parts:
             mesh = self._tree["meshes"][index]
-            if any(mesh.get("weights", [])):
-                self._source.warn(
-                    "skin", "its morph targets are left out: the shape is that without them"
-                )
             self._parts[index] = [
                 (part, self._part(part))
                 for part in mesh["primitives"]

@@ -213,6 +213,7 @@ def test_a_texture_without_coordinates_or_format_is_named(read):
     ]
     assert "lacks TEXCOORD_2" in read(tree)[1][0]
     tree.content["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
+    tree.content["extensionsRequired"] = ["KHR_texture_basisu"]
     assert "in a format that is not read" in read(tree)[1][0]
 
 
@@ -221,6 +222,22 @@ def test_morph_targets_are_named(read):
     tree.part(BOX.faces)
     tree.content["meshes"][0]["weights"] = [0.5]
     assert "morph targets are left out" in read(tree)[1][0]
+    tree.content["nodes"] = [{"mesh": 0, "weights": [0.0]}]
+    assert read(tree)[1] == []
+    tree.content["meshes"][0]["weights"] = [0.0]
+    tree.content["nodes"] = [{"mesh": 0, "weights": [0.5]}]
+    assert "morph targets are left out" in read(tree)[1][0]
+
+
+def test_invisible_nodes_and_their_children_are_left_out(read):
+    tree = Tree()
+    tree.part(BOX.faces)
+    hidden = {"KHR_node_visibility": {"visible": False}}
+    nodes = [{"mesh": 0}, {"children": [2], "extensions": hidden}, {"mesh": 0}]
+    tree.content |= {"nodes": nodes, "scenes": [{"nodes": [0, 1]}]}
+    mesh, said = read(tree)
+    assert len(mesh.faces) == 12
+    assert "its invisible parts are left out" in said[0]
 
 
 DAMAGED = """
