@@ -151,13 +151,15 @@ def _check_start(path: Path) -> None:
 
 
 def _read_off(source: MeshSource) -> ReadMesh:
-    """Read an OFF file; colours are ignored."""
+    """Read an OFF file; colours are left out."""
     data = plain_text(source.data())
     check_lines(data)
     header, _, rest = re.sub(rb"#[^\n]*+", b"", data).partition(b"OFF")
     lines = [line.split() for line in rest.splitlines() if line.strip()]
     if len(header) > 16 or not lines:
         raise ValueError("not an OFF file")
+    if b"4" in header or b"n" in header:
+        raise ValueError("its vertices have more than three coordinates; export three")
     V, F = map(int, lines[0][:2])
     points = lines[1 : 1 + V]
     rows = lines[1 + V : 1 + V + F]
@@ -165,6 +167,8 @@ def _read_off(source: MeshSource) -> ReadMesh:
     is_cut = len(lines) < 1 + V + F or (F > 0 and len(faces[-1]) < int(rows[-1][0]))
     if min(V, F) < 0 or is_cut:
         raise ValueError("the file ends too early")
+    if b"C" in header or any(len(row) > 1 + int(row[0]) for row in rows):
+        source.warn("material", "it has colours, which are not read; they are left out")
     vertices = np.array([point[:3] for point in points], np.float64).reshape(-1, 3)
     corners = np.array([word for face in faces for word in face], np.int64)
     picked, _ = triangulated(vertices, corners, np.array([*map(len, faces)], np.int64))

@@ -136,6 +136,7 @@ def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path, monkeypatc
         ("a.off", b"OFF\n1000000000 1000000000 0\n0 0 0\n", "too early"),
         ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
         ("a.off", b"OFF\n4 1 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2\n", "too early"),
+        ("a.off", b"4OFF\n3 1 0\n0 0 0 2\n1 0 0 2\n1 1 0 2\n3 0 1 2\n", "more than three"),
         ("a.ply", QUAD + "4 0 1 2\n", "ends within its last row"),
         (
             "a.ply",
