@@ -10,6 +10,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import trimesh
 from PIL import Image
 
@@ -153,6 +154,7 @@ def read_collada(source: MeshSource) -> ReadMesh:
     data = bounded(source)
     root = read_xml(data)
     _check_copies(root)
+    _name_unread(source, root)
     stated = {local_name(one): one for one in root.iter() if local_name(one) in ("unit", "up_axis")}
     axis = (stated["up_axis"].text or "").strip() if "up_axis" in stated else "Y_UP"
     with warnings.catch_warnings(record=True) as caught:
@@ -161,12 +163,39 @@ def read_collada(source: MeshSource) -> ReadMesh:
             BytesIO(data), file_type="dae", resolver=_Pictures(source), process=False
         )
         found = joined_scene(scene)
+    if any(map(_has_filled_gaps, scene.geometry.values())):
+        text = "it has polygons that are not convex, whose gaps are filled; export triangles"
+        source.warn("parts", text)
     for warning in caught:
         if "texture" in str(warning.message) or "colours" in str(warning.message):
             source.warn("texture", str(warning.message))
     if "unit" in stated:
         found = found.in_unit_of(float(stated["unit"].get("meter", "1")))
     return replace(found, up={"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}.get(axis))
+
+
+def _name_unread(source: MeshSource, root: Any) -> None:
+    """Warn of faces with holes and of transforms that pycollada does not read; those of cameras
+    move no mesh."""
+    for one in root.iter():
+        children = {local_name(child) for child in one}
+        names = {"ph"} if local_name(one) == "polygons" else {"skew", "lookat"}
+        for name in sorted(children & names if "instance_camera" not in children else ()):
+            source.warn("parts", f"its elements <{name}> are not read; export triangles at places")
+
+
+def _has_filled_gaps(mesh: Any) -> bool:
+    """Whether the fan that pycollada makes of a polygon folds back, as of one that is not convex;
+    the two sides of a face have the same corners, and are no fold."""
+    corners = np.asarray(mesh.triangles)
+    first = corners[:-1]
+    second = corners[1:]
+    is_fan = (first[:, [0, 2]] == second[:, [0, 1]]).all(axis=(1, 2))
+    is_fan &= (first[:, 1] != second[:, 2]).any(axis=1)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sizes = np.linalg.norm(normals, axis=1)
+    products = (normals[:-1] * normals[1:]).sum(axis=1)
+    return bool((is_fan & (products < -0.99 * sizes[:-1] * sizes[1:])).any())
 
 
 _GROUPS = ("node", "visual_scene", "library_visual_scenes", "library_nodes")

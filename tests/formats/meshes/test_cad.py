@@ -203,6 +203,28 @@ def test_collada_names_textures_that_it_cannot_use(write, load):
 
 
 @needs("collada")
+def test_collada_names_polygons_and_transforms_that_it_misreads(write, load):
+    write("label.png", encoded(noise()))
+    start, _, rest = collada().partition("<triangles")
+    start = start.replace('count="9">0 0 0 4 0 0 0 2 0<', 'count="12">0 0 0 4 0 0 0 2 0 1 .5 0<')
+    start = start.replace('count="3" stride="3"', 'count="4" stride="3"')
+    end = rest.partition("</triangles>")[2]
+
+    def said(kind, content, end=end):
+        inputs = '<input semantic="VERTEX" source="#v" offset="0"/>'
+        primitive = f'<{kind} count="1">{inputs}{content}</{kind}>'
+        return "".join(load(write("a.dae", start + primitive + end))[1])
+
+    assert said("polylist", "<vcount>4</vcount><p>0 1 3 2</p>") == ""
+    assert said("polylist", "<vcount>3 3</vcount><p>0 1 2 0 2 1</p>") == ""
+    assert "whose gaps are filled" in said("polylist", "<vcount>4</vcount><p>1 3 2 0</p>")
+    hole = "<p>0 1 2</p><ph><p>0 1 2</p><h>0 3 1</h></ph>"
+    assert "elements <ph> are not read" in said("polygons", hole)
+    skewed = end.replace("<translate>", "<skew>45 0 1 0 1 0 0</skew><translate>")
+    assert "elements <skew> are not read" in said("polygons", "<p>0 1 2</p>", skewed)
+
+
+@needs("collada")
 def test_hostile_collada_files_are_refused(refused):
     nodes = "".join(
         f'<node id="n{k}">' + f'<instance_node url="#n{k + 1}"/>' * 10 + "</node>"
