@@ -93,6 +93,7 @@ class BOPDataset(ObjectDataset):
             raise MissingFileError(
                 f"no such folder; {_README} shows the layout", subject=self.root / models
             )
+        self.models = models
         self._models = BOPModels(self.root / models)
         self.models_info = self._models.info
         target_file = self.root / "test_targets_bop19.json"

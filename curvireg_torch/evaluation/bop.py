@@ -75,6 +75,9 @@ class BOPBenchmark(Benchmark):
                 seen = f"{few} of {len(self.entries)} objects are seen in fewer photographs"
                 warnings.warn(f"views={protocol.views}: {seen}", CurviregWarning, stacklevel=2)
 
+    def settings(self) -> Row:
+        return {**super().settings(), "models": self.dataset.models}
+
     def _views(self, first: int, group: Sequence[int]) -> tuple[Entry, ...]:
         """Photographs drawn from those of ``group`` to be registered together with that of the
         sample ``first``."""

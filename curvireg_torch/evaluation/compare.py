@@ -235,7 +235,9 @@ def in_words(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
 
 
 def _how(run: Run) -> str:
-    return f"preset {run.settings.get('preset')}, {run.settings.get('protocol')}"
+    meshes = run.settings.get("models", "models")
+    named = "" if meshes == "models" else f"meshes of {meshes}, "
+    return f"preset {run.settings.get('preset')}, {named}{run.settings.get('protocol')}"
 
 
 def _digits(comparison: Comparison) -> str:

@@ -214,7 +214,8 @@ def test_evaluate_keeps_the_views_of_the_preset_paper(pascal, evaluate, out, mon
 def test_evaluate_bop_assumes_any_pose(bop, evaluate):
     summary = evaluate("bop", bop.root, "--protocol", "box=0.1", "seed=3")
     settings = summary["settings"]
-    check_values(settings, dataset="bop", protocol="cad=annotated pose=any box=0.1 seed=3")
+    protocol = "cad=annotated pose=any box=0.1 seed=3"
+    check_values(settings, dataset="bop", models="models", protocol=protocol)
     check_values(settings["pipeline"]["views"], pose="any", directions=18, theta_step=360.0)
 
 
