@@ -84,14 +84,17 @@ YOLO = """
 0 0.25 0.25 0.75 0.25 0.75 0.75 0.25 0.75        | 1.0  |     | an oriented box
 0 0.5 0.25 0.75 0.5 0.5 0.75 0.25 0.5 0.25       | 0.25 |     | with its score
 0 0.25 0.25 0.75 0.25 0.75 0.75 0.25 0.75 7      | 1.0  | "7" | with its number of a tracker
-0 0.5 0.25 0.75 0.5 0.5 0.75 0.25 0.5 0.25 1     | 0.25 | "1" | with both
+0 0.5 0.25 0.75 0.5 0.5 0.75 0.25 0.5 0.25 2     | 0.25 | "2" | with both
 0 0.25 0.5 0.5 0.25 0.75 0.5 0.6 0.75 0.4 0.75   | 1.0  |     | a polygon
 0 0.25 0.5 0.5 0.25 0.75 0.5 0.6 0.75 0.4 0.75 2 | 1.0  | "2" | with its number of a tracker
 """
 
 
-def test_a_triangle_on_the_border_is_no_box_of_a_tracker(write):
-    (box,) = read_boxes(write("a.txt", "0 0.1 0.2 0.5 0.9 0.9 1"))
+@pytest.mark.parametrize(
+    "corners", ["0.1 0.2 0.5 0.9 0.9 1", "0.1 0.2 0.3 0.2 0.3 0.3 0.3 0.4 0.9 1"]
+)
+def test_a_polygon_that_ends_on_the_border_is_none_of_a_tracker(write, corners):
+    (box,) = read_boxes(write("a.txt", f"0 {corners}"))
     assert (box.corners, box.track) == ((0.1, 0.2, 0.9, 1.0), "")
 
 

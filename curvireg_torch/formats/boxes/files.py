@@ -124,7 +124,9 @@ def _yolo_box(numbers: Sequence[float]) -> ImageBox | None:
     # else the corners of a triangle, the last of which lies on the border
     is_inside = min(corners) > -BEYOND and max(corners) < 1.0 + BEYOND
     is_box = count < 6 or (count == 6 and is_whole and is_inside)
-    has_track = is_whole and (count > 8 or (is_box and count > 4))
+    # an even number that ends with 1 is a polygon down to the border, not a score and a track
+    is_track = count > 4 if is_box else count > 8 and (count % 2 == 1 or numbers[-1] > 1.0)
+    has_track = is_whole and is_track
     ending = more if is_box else list(numbers)
     track = str(int(ending.pop())) if has_track else ""
     has_score = len(ending) % 2
