@@ -23,6 +23,7 @@ from ..utils.checks import (
     check_symmetries,
     check_tensor,
 )
+from ..utils.precision import full_precision
 
 __all__ = [
     "ADD_THRESHOLDS",
@@ -47,6 +48,7 @@ MSPD_THRESHOLDS = tuple(5.0 * step / 640.0 for step in range(1, 11))
 """Image widths of BOP's average recall of MSPD: 5, 10, ..., 50 px times width / 640."""
 
 
+@full_precision()
 def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     """ADD (Hinterstoisser et al. 2012): mean over the points x of ``|T_est x - T_gt x|``.
 
@@ -68,6 +70,7 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     return torch.cat(means).where(valid, torch.inf)
 
 
+@full_precision()
 def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     """ADD-S: mean over the points x of the distance of ``T_gt x`` to the nearest ``T_est y``.
 
@@ -88,6 +91,7 @@ def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     return T_est.new_tensor(means).where(valid, torch.inf)
 
 
+@full_precision()
 def mssd_error(
     T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tensor | None = None
 ) -> Tensor:
@@ -118,6 +122,7 @@ def mssd_error(
     return _least_maximum(largest, difference.shape[:2], points).where(valid, torch.inf)
 
 
+@full_precision()
 def mspd_error(
     T_est: Tensor,
     T_gt: Tensor,
@@ -258,6 +263,7 @@ def median_error(errors: Tensor) -> float:
     return median(errors.tolist()) if len(errors) else math.nan
 
 
+@full_precision()
 def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) -> Tensor:
     """Rotation error of an object with discrete symmetries: ``min_S angle(R_est, R_gt S)``.
 

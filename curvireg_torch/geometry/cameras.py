@@ -17,6 +17,7 @@ from ..utils.checks import (
     check_pose,
     check_rotation,
 )
+from ..utils.precision import full_precision
 from .conversions import cross_matrix, matrix_of_rows
 
 MAX_BOX_ITERATIONS = 20
@@ -90,6 +91,7 @@ def pose_around(R: Tensor, place: Tensor, point: Tensor) -> Tensor:
     return transform(R, place - R @ point)
 
 
+@full_precision()
 def project_points(
     points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False
 ) -> Tensor:

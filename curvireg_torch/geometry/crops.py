@@ -10,6 +10,7 @@ from ..errors import MAX_BOX_COORDINATE, InvalidInputError
 from ..utils.aliases import Size
 from ..utils.checks import as_boxes, check_integer, check_positive, check_tensor
 from ..utils.likes import BoxesLike
+from ..utils.precision import full_precision
 from .conversions import matrix_of_rows
 
 SAMPLES_AT_A_TIME = 64  # of a matrix product: fewer are slow, more multiply by many zeros
@@ -132,6 +133,7 @@ def _scale_and_shift(scale: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return matrix_of_rows([[scale, zero, x], [zero, scale, y], [zero, zero, one]])
 
 
+@full_precision()
 def crop_images(
     images: Tensor | Sequence[Tensor], boxes: BoxesLike, *, size: int = 256, margin: float = 0.1
 ) -> tuple[Tensor, Tensor]:

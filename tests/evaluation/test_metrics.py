@@ -77,6 +77,9 @@ def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity():
     assert_allclose(metrics.symmetric_rotation_error(est, gt, symmetries), slow, atol=1e-6)
     plain = metrics.symmetric_rotation_error(est, gt, torch.empty(0, 3, 3))
     assert_close(plain, rotation_error(est, gt))
+    single = [x.float() for x in (est, gt, symmetries)]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert_allclose(metrics.symmetric_rotation_error(*single), slow, atol=1e-3)
     assert metrics.symmetric_rotation_error(est[:0], gt[:0], symmetries).shape == (0,)
 
 
@@ -168,7 +171,8 @@ def test_pose_errors_contract(error):
     one_by_one = [error(e[None], g[None], POINTS) for e, g in zip(EST, GT, strict=True)]
     assert_close(torch.cat(one_by_one), whole)
     assert error(EST[:0], GT[:0], POINTS).shape == (0,)
-    single = error(EST.float(), GT, POINTS)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        single = error(EST.float(), GT.float(), POINTS.float())
     assert single.dtype == torch.float32
     assert_close(single.double(), whole, rtol=1e-3, atol=1e-5)
     # would map every point to the origin, which may be close to the surface

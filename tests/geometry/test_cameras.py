@@ -33,6 +33,9 @@ def test_project_points_agrees_with_opencv():
     mixed = g.project_points(points.float(), T, K.float())
     assert mixed.dtype == torch.float64
     assert_allclose(mixed, expected, atol=1e-3)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        single = g.project_points(points.float(), T.float(), K.float())
+    assert_allclose(single, expected, atol=1e-3)
     for wrong, message in ((X, "got ndarray"), (torch.ones(40, 2), r"shape \(\*, 3\)")):
         with refused(f"points: expected .*{message}"):
             g.project_points(wrong, T, K)

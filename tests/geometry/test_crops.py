@@ -78,6 +78,14 @@ def test_crop_images_takes_sizes_of_numpy():
     assert crops.shape == (1, 2, 6, 6)
 
 
+def test_crop_images_resamples_in_full_precision_under_autocast():
+    image = torch.rand(1, 3, 60, 80)
+    expected, _ = g.crop_images(image, [[30, 20, 60, 50]], size=32)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        crops, _ = g.crop_images(image, [[30, 20, 60, 50]], size=32)
+    assert torch.equal(crops, expected)
+
+
 def test_crop_images_refuses_a_list_of_grey_and_colour():
     images = [torch.rand(3, 20, 30), torch.rand(1, 20, 30)]
     with refused(r"images: expected shape \(3, \*, \*\), got \(1,"):
