@@ -36,6 +36,7 @@ from ..utils.arrays import Array
 from ..utils.checks import check_device, check_finite, check_symmetries, check_tensor
 from ..utils.files import tensor_checksum, write_tensors
 from ..utils.likes import MeshLike
+from ..utils.precision import full_precision
 from ..utils.threads import single_threaded_pool
 from .cells import Packing, packing_of_views
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
@@ -172,6 +173,7 @@ class ViewBank:
             )
 
     @classmethod
+    @full_precision()
     def build(
         cls,
         mesh: MeshLike,

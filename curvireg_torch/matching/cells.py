@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..utils.checks import check_symmetries
 from ..utils.files import keep_tensors, kept_tensors
+from ..utils.precision import full_precision
 
 ROUNDING_OF_TRACE = 1e-5  # so that views exactly as far apart as the angle count as one
 MAX_STORED_VIEWS = 2048
@@ -159,6 +160,7 @@ def _read_features(path: Path) -> dict[int, Tensor]:
     return dict(zip(tensors["views"].tolist(), tensors["features"], strict=True))
 
 
+@full_precision()
 def _store(path: Path, features: dict[int, Tensor], stored: set[int]) -> None:
     """Add features to those of a file, unless it has them."""
     if features.keys() <= stored or not path.parent.is_dir():

@@ -63,6 +63,12 @@ def assert_same(a, b, *, atol=0.0):
     assert a.settings == b.settings
 
 
+def test_build_computes_in_full_precision_under_autocast(truck):
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        bank = build(truck, TWO)
+    assert_same(bank, build(truck, TWO))
+
+
 def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck, monkeypatch, threads):
     monkeypatch.setattr(bank_module, "TURNS", 5)
     monkeypatch.setattr(bank_module, "PIXELS_AT_A_TIME", 1)
