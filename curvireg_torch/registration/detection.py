@@ -19,7 +19,7 @@ from ..geometry.framing import boxes_at
 from ..geometry.pose_prior import PosePrior
 from ..matching.detector import SAME_OBJECT_OVERLAP, Proposals
 from ..utils.likes import CameraLike, ImagesLike
-from ..utils.precision import exact_convolutions
+from ..utils.precision import exact_convolutions, full_precision
 from .block import keypoint_poses
 from .camera import limits_of, usual_camera
 from .confidence import detection_probability, two_decimals
@@ -76,6 +76,7 @@ def detect(
 
 
 @torch.no_grad()
+@full_precision()
 def detect_prepared(target: Target, items: Items, *, instances: int = 1) -> list[Results]:
     """:func:`detect` in photographs that :func:`.as_photographs` has prepared."""
     if instances < 1:

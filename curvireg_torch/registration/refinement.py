@@ -14,7 +14,7 @@ from ..geometry.framing import boxes_at
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability, check_tensor
 from ..utils.likes import ArrayLike, CameraLike, ImagesLike
-from ..utils.precision import exact_convolutions
+from ..utils.precision import exact_convolutions, full_precision
 from .block import Described, evidence_of
 from .camera import focal_covariance
 from .confidence import are_near, is_calibrated, refinement_confidence
@@ -153,6 +153,7 @@ def refine(
 
 
 @torch.no_grad()
+@full_precision()
 def refine_prepared(
     target: Target,
     items: Items,

@@ -141,7 +141,6 @@ class Registrar(Target):
             )
 
     @torch.no_grad()
-    @full_precision()
     def __call__(
         self,
         images: ImagesLike,
@@ -207,7 +206,6 @@ class Registrar(Target):
         """Return the registrar of one of several meshes, by :attr:`Registration.mesh_index`."""
         return self.others[mesh_index - 1] if mesh_index else self
 
-    @full_precision()
     def refine(
         self, images: ImagesLike, camera_matrices: CameraLike | None, poses: ArrayLike
     ) -> Results:

@@ -15,6 +15,7 @@ from ..geometry.crops import crop_transforms, square_boxes
 from ..matching import ViewDescriber
 from ..rendering.contours import LEVELS
 from ..utils.arrays import Bytes, Flags, Floats, Singles
+from ..utils.precision import full_precision
 from .encoding import rescaled, to_uint8
 
 OUTLINE = (0, 255, 80)
@@ -71,6 +72,7 @@ def draw_close_up(
     return draw_window(image, window, side / max(x1 - x0, y1 - y0), objects)
 
 
+@full_precision()
 def draw_window(
     image: Tensor, window: Sequence[int], scale: float, objects: Sequence[Drawn]
 ) -> Bytes:

@@ -21,6 +21,7 @@ from ..terms import crop_photographs, photograph_field
 from ..utils.arrays import Bytes
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, ImageLike
+from ..utils.precision import full_precision
 from .contours import Drawn, draw_close_up, draw_window
 from .encoding import to_uint8
 from .words import pose_in_words
@@ -167,6 +168,7 @@ def _paste_tiles(
 
 
 @torch.no_grad()
+@full_precision()
 def side_pictures(
     registrar: Registrar,
     result: Registration | Hypothesis,
@@ -209,6 +211,7 @@ def _field_picture(field: Tensor) -> Bytes:
 
 
 @torch.no_grad()
+@full_precision()
 def registration_sheet(
     registrar: Registrar,
     result: Registration,

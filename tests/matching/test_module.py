@@ -13,8 +13,9 @@ from torch.testing import assert_close
 from curvireg_torch import Registrar, ViewMatcher, terms
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import ImageGradient
-from curvireg_torch.registration import Follower
+from curvireg_torch.registration import Follower, detect, refine
 from curvireg_torch.terms import QueryFeatures
+from curvireg_torch.visualization import registration_sheet
 from tests._support import CAMERA, answer_to, eye, refused, scene, sequence, truck_bank
 
 
@@ -48,18 +49,23 @@ def _boxed(registrar):
 
 
 def _detected(registrar):
-    return registrar([scene(0)[0]], None, CAMERA)[0].transform
+    return detect(registrar, [scene(0)[0]], CAMERA)[0][0].transform
 
 
 def _refined(registrar):
     image, _, T = scene(0)
-    return registrar.refine([image], CAMERA, T[None])[0].transform
+    return refine(registrar, [image], CAMERA, T[None])[0].transform
 
 
 def _together(registrar):
     image, box, _ = scene(0)
     cameras = eye(4).repeat(2, 1, 1)
     return registrar.register_views([image, image], box.expand(2, 4), CAMERA, cameras).transform
+
+
+def _drawn(registrar):
+    image, box, _ = scene(0)
+    return torch.from_numpy(registration_sheet(registrar, answer_to(0, registrar), image, box))
 
 
 def _followed(registrar):
@@ -70,7 +76,7 @@ def _followed(registrar):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("register", [_boxed, _followed, _detected, _refined, _together])
+@pytest.mark.parametrize("register", [_boxed, _drawn, _followed, _detected, _refined, _together])
 def test_registrar_computes_in_full_precision_under_autocast(small_bank, register):
     detection = replace(small_bank.pipeline.detection, proposals=1)
     pipeline = replace(small_bank.pipeline, detection=detection)
