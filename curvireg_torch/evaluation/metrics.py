@@ -7,6 +7,7 @@ as a miss. Thresholds are strict: an error equal to the threshold is a miss.
 
 import math
 from collections.abc import Callable, Sequence
+from functools import reduce
 from statistics import median
 
 import torch
@@ -209,8 +210,8 @@ def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
 
 
 def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """In the dtype of ``T_est``, missing estimates replaced by the truth; and a mask of valid
-    estimates."""
+    """In the widest of their dtypes, at least float32, missing estimates replaced by the truth; and
+    a mask of valid estimates."""
     check_tensor(T_est, "T_est", (None, 4, 4))
     check_tensor(T_gt, "T_gt", (len(T_est), 4, 4))
     check_tensor(points, "points", (None, 3))
@@ -218,11 +219,12 @@ def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tenso
         raise InvalidInputError("points: expected at least one point, got none")
     check_finite(points, "points")
     check_pose(T_gt, "T_gt")
-    T_gt = T_gt.to(T_est.dtype)
+    dtype = reduce(torch.promote_types, (T_est.dtype, T_gt.dtype, points.dtype), torch.float32)
+    T_est, T_gt, points = (x.to(dtype) for x in (T_est, T_gt, points))
     valid = T_est.isfinite().flatten(1).all(1)
     T_est = torch.where(valid.view(-1, 1, 1), T_est, T_gt)
     check_pose(T_est, "T_est")
-    return T_est, T_gt, points.to(T_est.dtype), valid
+    return T_est, T_gt, points, valid
 
 
 def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:

@@ -175,6 +175,8 @@ def test_pose_errors_contract(error):
         single = error(EST.float(), GT.float(), POINTS.float())
     assert single.dtype == torch.float32
     assert_close(single.double(), whole, rtol=1e-3, atol=1e-5)
+    half = EST.half()
+    assert torch.equal(error(half, GT, POINTS), error(half.double(), GT, POINTS))
     # would map every point to the origin, which may be close to the surface
     zero = torch.zeros_like(EST)
     for est, gt, points, message in (
