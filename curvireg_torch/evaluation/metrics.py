@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..geometry import rotation_error
+from ..geometry import rotation_error, transform
 from ..utils.checks import (
     check_camera_matrix,
     check_finite,
@@ -101,7 +101,7 @@ def mssd_error(
 
     Args:
         T_est, T_gt, points: as in :func:`add_error`.
-        symmetries: (S, 4, 4) of the model, S >= 1, including the identity, for example from
+        symmetries: (S, 4, 4) or (S, 3, 3) of the model, S >= 1, with the identity, as those of
             :func:`curvireg_torch.geometry.symmetry_transforms`; None: only the identity.
 
     Example:
@@ -231,6 +231,8 @@ def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
     if symmetries is None:
         return torch.eye(4, dtype=like.dtype, device=like.device)[None]
     check_symmetries(symmetries)
+    if symmetries.shape[1] == 3:
+        symmetries = transform(symmetries, torch.zeros_like(symmetries[:, 0]))
     return symmetries.to(like)
 
 

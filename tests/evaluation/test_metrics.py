@@ -2,6 +2,7 @@
 input is refused."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from curvireg_torch.evaluation import metrics
-from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
+from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, transform
 from tests._support import double, eye, refused, seeded, uniform
 from tests._support.poses import poses, rotations
 from tests._support.spies import spied
@@ -130,6 +131,14 @@ def test_mssd_and_mspd_against_loops(monkeypatch):
         monkeypatch.setattr(metrics, "BOUNDING_POINTS", few)
         assert_allclose(metrics.mssd_error(EST, GT, POINTS, symmetries=symmetries), mssd)
         assert_allclose(metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd)
+
+
+def test_rotations_count_as_symmetries_without_translation():
+    turns = torch.cat([SYMMETRIES, R])
+    symmetries = transform(turns, torch.zeros(6, 3).double())
+    for error in (metrics.mssd_error, partial(metrics.mspd_error, camera_matrix=K)):
+        expected = error(EST, GT, POINTS, symmetries=symmetries)
+        assert torch.equal(error(EST, GT, POINTS, symmetries=turns), expected)
 
 
 def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(monkeypatch):
