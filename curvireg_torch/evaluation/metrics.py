@@ -19,6 +19,7 @@ from ..geometry import rotation_error, transform
 from ..utils.checks import (
     check_camera_matrix,
     check_finite,
+    check_numbers,
     check_pose,
     check_rotation,
     check_symmetries,
@@ -204,9 +205,8 @@ def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
         0.5
     """
     _check_errors(errors)
-    return sum(float((errors < threshold).double().mean()) for threshold in thresholds) / len(
-        thresholds
-    )
+    limits = check_numbers(thresholds, "thresholds").tolist()
+    return sum(float((errors < limit).double().mean()) for limit in limits) / len(limits)
 
 
 def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -201,6 +201,9 @@ def test_pose_errors_contract(error):
 
 
 def test_metrics_refuse_wrong_input():
+    for thresholds in ([], iter([0.1])):
+        with refused("^thresholds: expected"):
+            metrics.average_recall(torch.rand(3), thresholds)
     for message, *given in (
         ("R_est: expected", R[0, 0], R, SYMMETRIES),
         ("R_gt: expected", R, R.tolist(), SYMMETRIES),
