@@ -116,7 +116,8 @@ def prepare(entry: Entry, photo: Photo | None = None) -> Photograph:
     camera, source = camera_of(entry, photo)
     H, W = photo.image.shape[-2:]
     mask = mask_as_shown(entry.mask, PictureSize((H, W), photo.orientation))
-    boxes, masks = (None if given is None else [given] for given in (entry.box, mask))
+    boxes = None if entry.box is None else [entry.box]
+    masks = None if mask is None else [mask]
     item = as_photographs([photo.image], boxes, camera, entry.prior, masks)[0]
     if isinstance(item, CurviregError):
         is_of_mask = item.subject == str(entry.mask)

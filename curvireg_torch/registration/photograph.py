@@ -29,6 +29,7 @@ from ..utils.checks import (
     as_boxes,
     as_camera_matrices,
     as_numbers,
+    as_tensor,
     check_finite,
     check_photograph,
     check_pixels,
@@ -238,7 +239,10 @@ def one_each(values: Any, count: int, name: str) -> list[Any]:
 
 def _is_missing(box: BoxLike | None) -> bool:
     """Whether a box is None, or all its numbers are NaN."""
-    return box is None or bool(as_numbers(box, "boxes").isnan().all())
+    if box is None:
+        return True
+    numbers = as_numbers(box, "boxes")
+    return numbers.numel() > 0 and bool(numbers.isnan().all())
 
 
 def rig_cameras(poses: ArrayLike, count: int) -> Tensor:
@@ -358,8 +362,11 @@ def _object_mask(mask: Any, image: Tensor) -> Tensor:
     """A mask of a photograph in any form as (H, W) float32 in [0, 1] on the CPU."""
     if isinstance(mask, str | PathLike):
         mask = read_mask(mask)
-    x = torch.as_tensor(mask) if isinstance(mask, np.ndarray | Tensor) else None
-    if x is None or not (x.dtype in (torch.bool, torch.uint8) or x.is_floating_point()):
+    x = as_tensor(mask, "mask")
+    is_mask = isinstance(x, Tensor) and (
+        x.dtype in (torch.bool, torch.uint8) or x.is_floating_point()
+    )
+    if not is_mask:
         raise InvalidInputError(
             f"mask: expected bool, uint8 or floating (H, W), or a path, got {type_and_shape(mask)}"
         )
@@ -420,19 +427,15 @@ def as_photo(image: ImageLike) -> Photo:
         return read_photo(image)
     if isinstance(image, Picture):
         return photo_of_picture(image)
+    x = as_tensor(image, "photograph")
     if isinstance(image, np.ndarray):
-        if not (np.issubdtype(image.dtype, np.number) or image.dtype == bool):
-            raise InvalidInputError(f"photograph: expected an array of numbers, got {image.dtype}")
-        image = torch.from_numpy(np.ascontiguousarray(image))
-        image = (
-            image[None] if image.ndim == 2 else image.movedim(-1, 0) if image.ndim == 3 else image
-        )
-    if not isinstance(image, Tensor):
+        x = x[None] if x.ndim == 2 else x.movedim(-1, 0) if x.ndim == 3 else x
+    if not isinstance(x, Tensor):
         raise InvalidInputError(
             f"expected a tensor, an array or a path, got {type(image).__name__}"
         )
-    check_photograph(image, "photograph")
-    return Photo(image)
+    check_photograph(x, "photograph")
+    return Photo(x)
 
 
 def check_crop(crop: Tensor) -> None:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,7 +22,7 @@ def type_and_shape(value: object) -> str:
     """What was passed instead of the expected tensor, for an error message."""
     return (
         f"{value.dtype} of shape {tuple(value.shape)}"
-        if isinstance(value, Tensor)
+        if isinstance(value, Tensor | np.ndarray)
         else type(value).__name__
     )
 
@@ -265,8 +266,32 @@ def are_nearly_equal(a: float, b: float) -> bool:
     return a > 0 and b > 0 and 1.0 / MAX_PIXEL_ASPECT <= a / b <= MAX_PIXEL_ASPECT
 
 
+def as_tensor(values: Any, name: str) -> Any:
+    """An array, of any strides and byte order, as a tensor, copied where torch cannot share it;
+    all else as it is. Refuses arrays and tensors with which torch cannot compute."""
+    x = values
+    if isinstance(values, np.ndarray):
+        try:
+            # torch warns of read-only arrays
+            native = np.require(values, values.dtype.newbyteorder("="), ["C", "W", "E"])
+            x = torch.from_numpy(native)
+        except TypeError as error:
+            raise InvalidInputError(
+                f"{name}: expected numbers of a dtype of torch, got {type_and_shape(values)}"
+            ) from error
+    if isinstance(x, Tensor):
+        is_float8 = x.is_floating_point() and x.element_size() == 1
+        if is_float8 or x.layout != torch.strided:
+            raise InvalidInputError(
+                f"{name}: expected a dense tensor of no float8, got {x.layout} of {x.dtype}; "
+                f"convert with to_dense() or float()"
+            )
+    return x
+
+
 def as_numbers(values: Any, name: str, *, dtype: torch.dtype = torch.float32) -> Tensor:
     """A tensor, an array, or nested lists of these as a floating tensor of at least ``dtype``."""
+    values = as_tensor(values, name)
     try:
         if isinstance(values, list | tuple):
             plain = all(
@@ -279,7 +304,7 @@ def as_numbers(values: Any, name: str, *, dtype: torch.dtype = torch.float32) ->
         else:
             # as_tensor would move a tensor to the default device
             x = values if isinstance(values, Tensor) else torch.as_tensor(values)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         reason = str(error).partition("\n")[0]
         raise InvalidInputError(
             f"{name}: expected numbers, got {type(values).__name__} ({reason})"

@@ -66,8 +66,9 @@ CameraLike: TypeAlias = ArrayLike | CalibratedCamera
 """A (3, 3) camera matrix in px, a :class:`curvireg_torch.Camera`, or one of these for each
 photograph."""
 
-MaskLike: TypeAlias = ArrayLike | PathName
-"""An (H, W) mask of the object, white, or the path of a picture."""
+MaskLike: TypeAlias = Tensor | Array | PathName
+"""An (H, W) tensor or array, the object white, in bool, uint8 or floating in [0, 1], or the path of
+a picture."""
 
 MeshLike: TypeAlias = Union[CleanMesh, "trimesh.Trimesh", "trimesh.Scene", PathName]
 """A mesh of :func:`curvireg_torch.load_mesh` or of trimesh, a scene whose parts are joined, or the

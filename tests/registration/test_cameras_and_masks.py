@@ -149,7 +149,8 @@ def test_masks_in_any_form_are_read_and_unusable_ones_named(tmp_path):
     Image.fromarray(mask.numpy()).save(tmp_path / "mask.png")
     photo = torch.rand(3, 40, 60)
     file = tmp_path / "mask.png"
-    for form in (mask, 255 * mask.byte(), mask.byte(), mask.double().numpy(), file):
+    turned = mask.flip(1).numpy()[:, ::-1]
+    for form in (mask, 255 * mask.byte(), mask.byte(), mask.double().numpy(), file, turned):
         item = as_photograph(photo, None, mask=form)
         assert torch.equal(item.mask, mask.float())
         assert item.box.tolist() == [19.5, 9.5, 49.5, 29.5]
@@ -161,12 +162,21 @@ def test_masks_in_any_form_are_read_and_unusable_ones_named(tmp_path):
         (torch.eye(40, 60), beside, "mask: no white pixel in the box"),
         (whole.T, None, f"mask: {other_shape}"),
         (whole.long(), None, "mask: expected bool, uint8 or floating"),
+        (whole.long().numpy(), None, r"a path, got int64 of shape \(40, 60\)"),
+        (whole.numpy().astype(object), None, "mask: expected numbers of a dtype of torch"),
+        (whole.to_sparse(), None, "mask: expected a dense tensor"),
         (255.0 * whole, None, "mask: expected values from 0 to 1"),
         ("no.png", None, "no.png: no such file"),
     ):
         (result,) = truck_registrar()([photo], boxes, masks=[mask])
         with refused(words, (InvalidInputError, FileNotFoundError)):
             _ = result.rotation
+
+
+def test_an_empty_box_is_refused():
+    """It is not a missing one, for which the object is searched for."""
+    with refused("boxes: expected"):
+        as_photographs([scene(0)[0]], [[]], CAMERA)
 
 
 def test_camera_is_scaled_to_each_photograph():

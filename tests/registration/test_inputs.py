@@ -4,14 +4,21 @@ like mistakes."""
 import weakref
 from dataclasses import replace
 
+import numpy as np
 import torch
+from PIL import Image
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration import Registrar, block
 from curvireg_torch.registration import photograph as photograph_module
-from curvireg_torch.registration.photograph import Photograph, as_photographs, camera_warnings
+from curvireg_torch.registration.photograph import (
+    Photograph,
+    as_photo,
+    as_photographs,
+    camera_warnings,
+)
 from tests._support import (
     CAMERA,
     SIZE,
@@ -68,6 +75,21 @@ def test_cameras_and_boxes_that_look_like_mistakes_are_questioned_or_refused():
         item = as_photographs([picture], [box], None)[0]
         assert isinstance(item, InvalidInputError) == refused
         assert ("at least 12 are needed" in str(item)) == refused
+
+
+def test_arrays_of_any_strides_and_byte_order_are_photographs():
+    pixels = np.asarray(Image.new("RGB", (60, 40), "red"))  # is read-only
+    single = pixels.astype("f4") / 255
+    expected = as_photo(pixels).image
+    assert torch.equal(as_photo(pixels[::-1]).image.flip(1), expected)
+    assert torch.equal(as_photo(single.astype(">f4")).image, as_photo(single).image)
+    assert pixels.flags.writeable is False
+    sparse = expected.float().to_sparse()
+    small = expected.to(torch.float8_e5m2)
+    bad = pixels.astype(object), single.astype(np.longdouble), sparse, small
+    for item in as_photographs(bad, None, None):
+        assert isinstance(item, InvalidInputError)
+        assert "photograph: expected" in str(item)
 
 
 def test_result_with_a_questionable_camera_is_never_reliable():

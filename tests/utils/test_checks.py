@@ -114,10 +114,13 @@ def test_check_photograph_and_check_pixels_refuse_other_images():
 
 def test_as_boxes_and_as_camera_matrices_accept_tensors_arrays_and_lists_only():
     boxes = torch.tensor([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
-    for given in (boxes.double(), [*boxes], boxes.tolist(), [*boxes.numpy()], boxes.int().numpy()):
+    arrays = boxes.int().numpy(), boxes.numpy().astype(">f4"), boxes.flip(0).numpy()[::-1]
+    for given in (boxes.double(), [*boxes], boxes.tolist(), [*boxes.numpy()], *arrays):
         assert torch.equal(checks.as_boxes(given, 2).float(), boxes)
     others = (
         [["a", "b", "c", "d"]],
+        [[10**400, 0, 1, 1]],
+        boxes[:1].to_sparse(),
         [[1.0, 2.0, 3.0]],
         [[1.0, 2.0], [3.0, 4.0, 5.0]],
         [None],
