@@ -66,6 +66,11 @@ class Workers:
         self._executor = executor
         self._processes: _Processes | None = None
         self.generation = 0  # counts the processes that were started together
+        if not isinstance(executor, Executor | None):
+            raise InvalidInputError(
+                f"executor: expected a concurrent.futures.Executor, got {type(executor).__name__}; "
+                f"that of a Dask client is client.get_executor()"
+            )
 
     def map(
         self,
@@ -291,7 +296,7 @@ class _Run(Generic[Task, Result]):
         arguments = self._key, content, self._function, block.tasks
         try:
             future = self._workers.submit(*arguments)
-        except BrokenExecutor:  # an idle worker ended
+        except RuntimeError:  # an idle worker ended, or the executor was shut down
             self._workers.leave(self._workers.generation)
             future = self._workers.submit(*arguments)
         block.generation = self._workers.generation

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 import warnings
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -36,7 +36,7 @@ def refused(_, tasks):
     raise InvalidInputError("cannot be used", subject=str(tasks))
 
 
-class InlineExecutor:
+class InlineExecutor(Executor):
     """An executor of this process, whose worker is lost with the tasks in ``ends``."""
 
     def __init__(self, ends=(), error=RuntimeError):
@@ -111,6 +111,15 @@ def test_workers_that_do_nothing_more_are_an_error(count, ends, failed):
 def test_an_executor_that_is_broken_is_not_renewed():
     with pytest.raises(WorkerError, match="the workers of the executor ended; give another one"):
         list(mapped([[1]], ends={1}, error=BrokenExecutor))
+
+
+def test_what_is_no_executor_or_was_shut_down_is_refused():
+    with pytest.raises(InvalidInputError, match=r"executor: expected .* got int"):
+        Workers(executor=5)
+    executor = ThreadPoolExecutor(1)
+    executor.shutdown()
+    with pytest.raises(WorkerError, match="the workers of the executor ended; give another one"):
+        list(Workers(executor=executor).map(doubled, None, [[1]]))
 
 
 def test_errors_of_the_function_are_raised_here():
