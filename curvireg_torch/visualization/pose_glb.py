@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from io import BytesIO
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from ..utils.checks import check_camera_matrix, check_photograph, check_pose, ch
 from ..utils.choices import UNITS
 from ..utils.likes import MeshLike
 from ..utils.srgb import linear_colours
-from .encoding import jpeg, shrink, to_uint8
+from .encoding import shrink, to_uint8
 
 _PHOTO_SIDE = 1024
 # from OpenCV's camera to glTF's, which has y up and looks along -z
@@ -161,8 +160,8 @@ def _photograph_plane(image: Tensor, K: Tensor, depth: float) -> trimesh.Trimesh
     pixels = np.column_stack([W * uv[:, 0] - 0.5, H * (1.0 - uv[:, 1]) - 0.5, np.ones(4)])
     corners = depth * pixels @ np.linalg.inv(K.numpy()).T
     faces = np.array([[0, 3, 2], [0, 2, 1]])  # counterclockwise after the flip
-    # exporters write it as JPEG
-    texture = Image.open(BytesIO(jpeg(shrink(to_uint8(image), _PHOTO_SIDE), 85)))
+    texture = Image.fromarray(shrink(to_uint8(image), _PHOTO_SIDE))
+    texture.format = "JPEG"  # in which exporters write it
     material = trimesh.visual.material.PBRMaterial(
         name="picture",
         baseColorTexture=texture,

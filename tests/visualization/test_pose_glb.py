@@ -1,6 +1,7 @@
 """The GLB is read back; its camera projects the mesh and the photograph to their pixels."""
 
 import json
+import os
 import struct
 from io import BytesIO
 
@@ -86,6 +87,19 @@ def test_pose_glb_keeps_vertex_colours():
     assert {tuple(c[:3]) for c in colours.tolist()} == {(147, 2, 2), (2, 2, 147)}, "linear"
     # Metal would be black without surroundings to reflect.
     assert tree["materials"][part["material"]]["pbrMetallicRoughness"]["metallicFactor"] == 0
+
+
+def test_pose_glb_needs_no_working_directory(monkeypatch):
+    """It may have been removed, and the file go elsewhere."""
+    T = eye(4)
+    T[2, 3] = 4.0
+
+    def removed():
+        raise FileNotFoundError
+
+    monkeypatch.setattr(os, "getcwd", removed)
+    tree = tree_of(pose_glb(trimesh.creation.box(), T, CAMERA, torch.rand(3, *SIZE)))
+    assert [picture["mimeType"] for picture in tree["images"]] == ["image/jpeg"]
 
 
 @pytest.mark.parametrize(("z", "message"), [(-2.0, "behind the camera"), (torch.nan, "finite")])
