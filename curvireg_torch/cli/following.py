@@ -233,7 +233,7 @@ def _started(
             confidence = 1.0 if start.confidence is None else start.confidence
         confidence = min(confidence, found.confidence_bound)
         if confidence >= KEPT_CONFIDENCE:
-            follow.start(image, known, confidence=confidence)
+            follow.start(image, known, confidence=confidence, warnings=found.warnings)
     return found
 
 

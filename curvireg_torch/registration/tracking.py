@@ -395,7 +395,14 @@ class Follower:
         )
 
     @torch.no_grad()
-    def start(self, image: ImageLike, pose: ArrayLike, *, confidence: float = 1.0) -> None:
+    def start(
+        self,
+        image: ImageLike,
+        pose: ArrayLike,
+        *,
+        confidence: float = 1.0,
+        warnings: Sequence[str] = (),
+    ) -> None:
         """Begin from a known pose, in place of registering the first frame. It is taken as it is,
         and not checked: :meth:`.Registrar.refine` does both.
 
@@ -404,6 +411,7 @@ class Follower:
             pose: (4, 4) rigid ``T_cam_from_model``.
             confidence: probability in [0, 1] that the pose is right; no tracked pose has more,
                 unless a registration confirms it. Below 0.5 each frame is checked.
+            warnings: of the answer that the pose is from, which hold for the frames that follow.
 
         Raises:
             InvalidInputError: ``pose`` is not rigid and finite, ``confidence`` is no probability,
@@ -420,7 +428,7 @@ class Follower:
         item = self._read(image)
         if not isinstance(item, Photograph):
             raise item
-        map_on_threads(lambda item: self._start(item, T, confidence), [item])
+        map_on_threads(lambda item: self._start(item, T, confidence, warnings), [item])
 
     def _read(
         self, image: ImageLike, box: BoxLike | None = None, prior: PosePrior | None = None
@@ -468,7 +476,7 @@ class Follower:
         with suppress(LostObjectError, ImageError):  # pixels around the last pose may be unusable
             tracked = self._tracker.track(item.image, item.K)
         found = None if tracked is None else self._registration(tracked, item)
-        if tracked and found and _confidence(found) >= TRUSTED_CONFIDENCE:
+        if tracked and found and self._is_trusted(tracked, found):
             self._tracker.accept(tracked)
             return found
         starts = (
@@ -495,6 +503,13 @@ class Follower:
         return (
             registered if isinstance(registered, Registration) and registered.reliable else refined
         )
+
+    def _is_trusted(self, tracked: TrackedPose, found: Registration) -> bool:
+        """Whether a tracked pose stands without a refinement: in the next frame the tracker, which
+        learns from it, finds even a wrong one with certainty."""
+        assert self._base is not None
+        is_less_sure = tracked.confidence < self._reliable <= self._base
+        return _confidence(found) >= TRUSTED_CONFIDENCE and not is_less_sure
 
     def _registered(
         self, image: ImageLike, box: BoxLike | None, least: float

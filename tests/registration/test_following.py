@@ -271,6 +271,24 @@ def test_frames_after_an_answer_that_is_questioned_are_not_reliable_either(monke
     assert found == ["reliable", "unsure"]
 
 
+def test_a_frame_that_is_less_sure_than_the_one_before_is_checked(monkeypatch):
+    """Learned from unchecked, a wrong pose would be tracked with certainty from then on."""
+    image, _, T = sequence(2)[1]
+    wrong = answer(T @ HALF_TURN, 0.0)
+    checks = []
+    for base, tracked in ((1.0, 0.91), (1.0, 0.89), (0.89, 0.89), (0.89, 0.56)):
+        follow = follower()
+        follow._base = base
+        monkeypatch.setattr(tracking, "tracking_confidence", lambda _, tracked=tracked: tracked)
+        refine = Mock(return_value=wrong)
+        monkeypatch.setattr(tracking, "refine_one", refine)
+        assert follow(image).confidence == pytest.approx(base * tracked)
+        checks.append(refine.call_count)
+        monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 1.0)
+        assert follow(image).reliable == (tracked == 0.91)
+    assert checks == [0, 1, 0, 1]
+
+
 def test_a_refined_pose_of_no_confidence_is_not_followed(monkeypatch):
     """It would bound all later ones, so that no frame were registered again."""
     image, box, T = sequence(2)[1]

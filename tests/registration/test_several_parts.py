@@ -27,6 +27,7 @@ def photograph(index, *, angle=0.0, ranking_share=0.5, **changes):
         "probabilities": (0.5,),
         "detection": None,
         "warnings": (),
+        "distance": 2.0,
         "notes": (),
         "ranking": None,
         "confidence_features": {"ranking_share": ranking_share},
@@ -55,6 +56,7 @@ class FakeRig:
 
     def __init__(self, _, photographs):
         self.photographs = photographs
+        self.eyes = double([[0.0, 0.0, -2.0]] * len(photographs))
 
     @staticmethod
     def of(_, found):
@@ -184,6 +186,45 @@ def test_doubts_are_means_by_votes_and_warnings_those_of_most(monkeypatch):
     assert features["unmatched"] == pytest.approx(3.5 - features["keypoints"])
     assert result.warnings == ("a", "b 400")
     assert joint(monkeypatch, {0: first, 1: third}, scores).warnings == ("a",), "not of one of two"
+
+
+@pytest.mark.parametrize(
+    ("against", "is_named"),
+    [([0.49], False), ([0.5], True), ([0.5, 0.49], True), ([0.9, 0.9], True)],
+)
+@pytest.mark.parametrize("counted", [1, 2])
+def test_as_many_photographs_that_contradict_the_pose_are_a_warning(
+    monkeypatch, against, is_named, counted
+):
+    """Those that are convinced of another one."""
+    confidences = [0.9] * counted + against
+    found = {k: photograph(k, confidence=confidences[k]) for k in range(len(confidences))}
+    missing = {k: "elsewhere" for k in found if k >= counted}
+    scores = {k: [9.0, 7.0, 4.0] for k in found}
+    warnings = joint(monkeypatch, found, scores, missing=missing).warnings
+    is_named = is_named and (counted == 1 or against == [0.9, 0.9])
+    assert [" photographs contradict the pose" in text for text in warnings] == [True] * is_named
+
+
+@pytest.mark.parametrize(
+    ("distances", "said"),
+    [
+        ((2.0, 2.0), ""),
+        ((2.2, 2.12), ""),
+        ((2.2, 2.16), "1.09 times as far away as by the places"),
+        ((1.8, 1.9), ""),
+        ((1.8, 1.86), "0.92 times as far"),
+        ((2.2, 1.8), ""),
+        ((3.0,), ""),  # one photograph tells no scale
+    ],
+)
+def test_distances_that_all_differ_from_those_of_the_cameras_are_a_warning(
+    monkeypatch, distances, said
+):
+    found = {k: photograph(k, distance=distance) for k, distance in enumerate(distances)}
+    warnings = joint(monkeypatch, found, {k: [9.0, 7.0] for k in found}).warnings
+    assert len(warnings) == bool(said)
+    assert said in "".join(warnings)
 
 
 @pytest.mark.parametrize("away", [0.0, 0.01, 100.0])
