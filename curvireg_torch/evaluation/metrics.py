@@ -17,9 +17,9 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..geometry import rotation_error, transform
 from ..utils.checks import (
+    as_numbers,
     check_camera_matrix,
     check_finite,
-    check_numbers,
     check_pose,
     check_rotation,
     check_symmetries,
@@ -205,7 +205,9 @@ def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
         0.5
     """
     _check_errors(errors)
-    limits = check_numbers(thresholds, "thresholds").tolist()
+    limits = as_numbers(thresholds, "thresholds", dtype=torch.float64).flatten().tolist()
+    if not limits:
+        raise InvalidInputError("thresholds: expected at least one number, got none")
     return sum(float((errors < limit).double().mean()) for limit in limits) / len(limits)
 
 

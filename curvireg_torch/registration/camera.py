@@ -366,6 +366,10 @@ WITHIN_REACH = 0.5
 fit lowers the deviation, to a third where the given one is 1.3 times the right focal length. With
 0.6, no more of 80 generated wrong ones are named."""
 
+SHOWN_FOCAL_LENGTH = "the photograph shows a focal length"
+STRETCHED = "the photograph looks stretched"
+"""Beginnings of warnings of a camera that a photograph contradicts."""
+
 LARGEST_CHANGE = 2.0  # of the logarithm of an unknown factor
 
 
@@ -525,7 +529,7 @@ def stretch_contradiction(gap: float, deviation: float) -> str | None:
         return None
     side = "width" if gap > 0.0 else "height"
     return (
-        f"the photograph looks stretched to {math.exp(abs(gap)):.2f} times its {side}; give it as "
+        f"{STRETCHED} to {math.exp(abs(gap)):.2f} times its {side}; give it as "
         "it was taken, with its own camera, unless the object has other proportions than the mesh"
     )
 
@@ -548,7 +552,7 @@ def focal_contradiction(
         return None
     shown = focal * torch.tensor(gap).exp().item()
     return (
-        f"the photograph shows a focal length of about {shown:.0f} px, not the camera's "
+        f"{SHOWN_FOCAL_LENGTH} of about {shown:.0f} px, not the camera's "
         f"{focal:.0f} px: the camera is of a picture of another size, or this one was cropped, "
         f"stretched or zoomed; give its own camera, or none"
     )

@@ -301,7 +301,7 @@ def _registered(target: Target, item: Photograph, pose: Hypotheses) -> Registrat
 
 def _probability_near(target: Target, registered: Registration, rotation: Tensor) -> float:
     """Probability of a pose with this ``rotation`` (3, 3) in a registration: that of the hypotheses
-    within 30 degrees of it."""
+    within 30 degrees of it, and at most its bound."""
     rotations = [hypothesis.allocentric_rotation for hypothesis in registered.hypotheses]
     near = are_near(torch.stack(rotations), rotation, target.symmetries_of(exact=target.is_exact))
     pairs = zip(registered.probabilities, near.tolist(), strict=True)

@@ -2,7 +2,8 @@
 
 import html
 import math
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Generic, Self, TypeVar, overload
 
@@ -358,11 +359,10 @@ class Registration:
 
     @property
     def confidence_bound(self) -> float:
-        """Most confidence of poses that follow from this one: 1, or less than of a reliable answer
-        if this one is not for another reason than its confidence."""
-        if self.reliable or self.is_doubtful:
-            return 1.0
-        return math.nextafter(self.reliable_from, 0.0)
+        """Most confidence of poses that follow from this one: 1, or less than a reliable answer has
+        where something else than its confidence makes this one unsure."""
+        certain = replace(self, probabilities=(1.0,))
+        return 1.0 if certain.reliable else math.nextafter(self.reliable_from, 0.0)
 
     @property
     def _likely_meshes(self) -> list[int]:
@@ -583,6 +583,15 @@ def likely_rivals(
     if len(likely) > 1 and is_pair and not is_hidden:
         likely[1] = True
     return [k for k, is_likely in enumerate(likely) if is_likely and k > 0]
+
+
+def kinds_of(warnings: Iterable[str]) -> dict[str, list[str]]:
+    """Warnings by what they say but for numbers: each photograph contradicts a wrong focal length
+    with another one."""
+    kinds: dict[str, list[str]] = {}
+    for text in warnings:
+        kinds.setdefault(re.sub(r"\d+", "", text), []).append(text)
+    return kinds
 
 
 def ambiguity(rotations: Tensor) -> str | None:

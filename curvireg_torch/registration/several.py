@@ -1,8 +1,6 @@
 """One pose from several photographs: each is registered alone, then candidates are compared in all
 of them."""
 
-import re
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -26,7 +24,7 @@ from .confidence import (
 from .detection import detect_prepared
 from .judging import best_of_meshes
 from .photograph import Photograph, as_photographs, check_cameras, copies_of, rig_cameras
-from .result import FailedRegistration, PhotographPose, Registration, Results
+from .result import FailedRegistration, PhotographPose, Registration, Results, kinds_of
 from .rig import ELSEWHERE, JointPoses, Rig, RigPhotograph, RigPhotographs
 from .stages import register_photographs
 from .target import Target
@@ -35,9 +33,9 @@ from .target import Target
 OTHER_PLACE = 0.15
 # Confidence of a photograph alone from which another pose in it contradicts that of the others
 CONVINCED = 0.5
-# Factor between the distances of an object by its size and by the places of the cameras, in all
-# photographs, that is a mistake: of right generated rigs it is 0.99 to 1.00, with translations of
-# 0.9 times their length 1.08 to 1.10
+# Factor by which the distances of an object by its size and by the places of the cameras may
+# differ: if they do so more in all photographs, something is wrong. In right generated rigs it is
+# 0.99 to 1.00, with translations of 0.9 times their length 1.08 to 1.10
 OTHER_SCALE = 1.07
 # Hypotheses of each photograph that are compared in all, even if fewer are reported
 JOINT_HYPOTHESES = 5
@@ -250,35 +248,32 @@ def _registration(
 
 def _warnings(rig: Rig, every: Rig, T: Tensor) -> tuple[str, ...]:
     """What is questionable about a ``rig`` whose best pose is ``T`` (1, 4, 4): what most of its
-    photographs warn of; as many others among ``every`` one that are convinced of another pose; and
-    distances from the size of the object that the cameras' places contradict."""
+    photographs warn of; that as many others, in the rig of ``every`` photograph, are convinced of
+    another pose; and that the object's size and the cameras' places tell other distances."""
     found = list(_warnings_of_most([p.result for p in rig.photographs]))
     counted = {p.index for p in rig.photographs}
     others = [p.result for p in every.photographs if p.index not in counted]
     against = sum((other.confidence or 0.0) >= CONVINCED for other in others)
     if against >= len(counted):
         found.append(
-            f"{against} of {len(every.photographs)} photographs contradict the pose: check that "
+            f"photographs contradict the pose ({against} of {len(every.photographs)}): check that "
             "T_cam_from_world belongs to them, in their order, and is not its inverse"
         )
     alone = torch.tensor([p.result.distance for p in rig.photographs], dtype=torch.float64)
     ratios = alone / torch.linalg.vector_norm(rig.centres(T) - rig.eyes, dim=-1)
     is_other = ratios.min() > OTHER_SCALE or ratios.max() < 1.0 / OTHER_SCALE
-    if len(ratios) > 1 and is_other:
+    if rig.exact and len(ratios) > 1 and is_other:
         found.append(
             f"by its size the object is {float(ratios.mean()):.2f} times as far away as by the "
-            "places of the cameras: check the translations of T_cam_from_world and the mesh's size"
+            "places of the cameras: check the translations of T_cam_from_world, the focal length "
+            "and the mesh's size"
         )
     return tuple(found)
 
 
 def _warnings_of_most(results: Sequence[Registration]) -> tuple[str, ...]:
-    """What more than half of the results warn of, as the first of them says it: a focal length that
-    each photograph contradicts is another number in each."""
-    kinds = defaultdict(list)
-    for result in results:
-        for text in result.warnings:
-            kinds[re.sub(r"\d+", "", text)].append(text)
+    """What more than half of the results warn of, as the first of them says it."""
+    kinds = kinds_of(text for result in results for text in result.warnings)
     return tuple(sorted(texts[0] for texts in kinds.values() if 2 * len(texts) > len(results)))
 
 

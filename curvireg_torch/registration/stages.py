@@ -12,7 +12,7 @@ from ..errors import CurviregError
 from ..evidence import EvidenceWeights
 from ..fitting.edges import EdgeCrops
 from ..geometry.crops import box_share, crop_transforms, square_boxes
-from ..geometry.framing import clipped, hidden_boxes, whole_boxes
+from ..geometry.framing import clipped, hidden_boxes, inside_boxes, whole_boxes
 from ..matching import Ranking
 from ..matching.search import search
 from ..terms import QueryFeatures
@@ -73,11 +73,10 @@ BESIDE_BOX = (
     "the pose lies beside the box, perhaps on another copy of the object: check the overlay, and "
     "draw the box around the one that is meant"
 )
-# Side in px of a crop in which a mask is compared with the mesh at the pose, by how many px it may
-# reach beyond, and the share of the mask that must lie there: of 24 generated objects it is 0.98
-# where mask and pose are right, and at most 0.89 of masks that are shifted by a fifth of the object
-MASK_SIZE = 64
-MASK_REACH = 2
+MASK_SIZE = 64  # side in px of a crop in which a mask is compared with the mesh at the pose
+MASK_REACH = 2  # px of it by which a mask may reach beyond the mesh
+# Share of a mask that must lie within this reach: of 24 generated objects it is 0.98 where mask and
+# pose are right, and at most 0.89 where the mask is shifted by a fifth of the object
 LEAST_MASK_SHARE = 0.9
 BESIDE_MASK = (
     "the mask reaches far beyond the object at this pose: check that it is of this object in this "
@@ -186,17 +185,19 @@ def _compared_with_input(
 
 
 def _mask_share(target: Target, item: Photograph, projection: tuple[Tensor, Tensor]) -> float:
-    """Share of a photograph's mask that lies on the mesh at a pose, or near it; 1 without one."""
+    """Share of a photograph's mask within its box that lies on the mesh at a pose, or near it; 1
+    without one."""
     margin = target.describer.settings.margin
     mask = item.mask_crop(MASK_SIZE, margin)
     if mask is None:
         return 1.0
     T, K = projection
-    transform = crop_transforms(square_boxes(item.box[None].float(), margin), MASK_SIZE)
+    box = item.box[None].float()
+    transform = crop_transforms(square_boxes(box, margin), MASK_SIZE)
     size = (MASK_SIZE, MASK_SIZE)
     depth = target.describer.renderer.render(T[None], transform.double() @ K, size)
     near = max_pool2d((depth > 0.0).float().cpu(), 2 * MASK_REACH + 1, 1, MASK_REACH)
-    white = (mask >= 0.5).float()
+    white = (mask >= 0.5).float() * inside_boxes(box, box, MASK_SIZE, margin)
     return float((white * near).sum() / white.sum()) if bool(white.any()) else 1.0
 
 

@@ -38,12 +38,14 @@ from ..rendering.contours import MeshContours
 from ..utils.checks import as_numbers, check_pose, check_probability, check_tensor
 from ..utils.likes import ArrayLike, BoxLike, ImageLike
 from ..utils.threads import map_on_threads
-from .confidence import RELIABLE, tracking_confidence
+from .camera import SHOWN_FOCAL_LENGTH, STRETCHED
+from .confidence import RELIABLE, is_calibrated, tracking_confidence
 from .hypotheses import Hypotheses, hypothesis_of
+from .mirror_image import MIRROR_WARNING
 from .photograph import Photograph, as_photographs
 from .refinement import OUTSIDE, refine_one
 from .registrar import Registrar
-from .result import FailedRegistration, Registration
+from .result import FailedRegistration, Registration, kinds_of
 from .target import nearest_view
 
 # Added around the object's box, as a fraction of its longer side: room for motion that was not
@@ -317,6 +319,9 @@ class Tracker:
 # better
 TRUSTED_CONFIDENCE = 0.5
 KEPT_CONFIDENCE = 0.2
+# Frames after which one that is trusted, and less sure than a reliable answer, is checked again;
+# then after twice as many, and so on
+FIRST_CHECK = 8
 # Confidence of a registration from which its pose is followed
 BELIEVED_CONFIDENCE = 0.5
 # Successive registrations that agree are followed from KEPT_CONFIDENCE on
@@ -336,8 +341,9 @@ class Follower:
 
     The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and
     10 % of the distance of the truth: the tracker's own, times that of the last pose that a
-    registration confirmed, less than of a reliable one if the registration was not; its warnings
-    hold for the frames that follow. No pose gains confidence from being followed, unless a further
+    registration confirmed. If that registration is not reliable, the frames that follow are not
+    either; they are checked again after 8 frames, 16, 32 and so on. What it warns of camera and
+    mesh holds for all later frames. No pose gains confidence from being followed, unless a further
     registration is reliable.
 
     Args:
@@ -381,8 +387,10 @@ class Follower:
         self._tracker = Tracker(describer.contours, describer.hull, reliable=self._reliable)
         # confidence of the pose that tracking goes on from, if there is one
         self._base: float | None = None
-        # and the warnings of the registration that confirmed it
+        # what registrations have warned of camera and mesh, and frames since the last check while
+        # the confidence is less than of a reliable answer
         self._warnings: tuple[str, ...] = ()
+        self._unsure = 0
         # registrations in a row that agree, none of which is believed
         self._agreeing: list[Tensor] = []
 
@@ -448,8 +456,13 @@ class Follower:
         self, item: Photograph, T: Tensor, confidence: float, warnings: Sequence[str] = ()
     ) -> None:
         self._tracker.start(item.image, item.K, T)
+        self._confirm(confidence, warnings)
+
+    def _confirm(self, confidence: float, warnings: Sequence[str]) -> None:
+        """Go on with the confidence of an answer, and what it warns of camera and mesh."""
         self._base = confidence
-        self._warnings = tuple(warnings)
+        self._warnings = _each_once((*self._warnings, *filter(_is_lasting, warnings)))
+        self._unsure = 0
 
     @torch.no_grad()
     def __call__(
@@ -492,8 +505,7 @@ class Follower:
                 self._tracker.accept(
                     self._tracker.measure(item.image, item.K, refined.projection[0])
                 )
-                self._base = _confidence(refined)
-                self._warnings = refined.warnings
+                self._confirm(_bounded(refined), refined.warnings)
             return refined
         if tracked and found and _confidence(found) >= KEPT_CONFIDENCE:
             self._tracker.accept(tracked)
@@ -508,8 +520,15 @@ class Follower:
         """Whether a tracked pose stands without a refinement: in the next frame the tracker, which
         learns from it, finds even a wrong one with certainty."""
         assert self._base is not None
-        is_less_sure = tracked.confidence < self._reliable <= self._base
-        return _confidence(found) >= TRUSTED_CONFIDENCE and not is_less_sure
+        if _confidence(found) < TRUSTED_CONFIDENCE:
+            return False
+        if not is_calibrated(self.registrar.pipeline):  # nothing can confirm it
+            return True
+        if self._base >= self._reliable:
+            return tracked.confidence >= self._reliable
+        self._unsure += 1
+        is_power_of_two = self._unsure & (self._unsure - 1) == 0
+        return not (self._unsure >= FIRST_CHECK and is_power_of_two)
 
     def _registered(
         self, image: ImageLike, box: BoxLike | None, least: float
@@ -525,8 +544,7 @@ class Follower:
         ):
             pose, K = result.projection
             with suppress(LostObjectError, ImageError):
-                confidence = min(_confidence(result), result.confidence_bound)
-                self._start(item.by(K), pose, confidence, result.warnings)
+                self._start(item.by(K), pose, _bounded(result), result.warnings)
                 if self._fits_camera:
                     self.camera_matrix = result.camera
         return result
@@ -555,12 +573,9 @@ class Follower:
         except CurviregError as error:
             return FailedRegistration(error)
         assert self._base is not None
-        bound = 1.0
-        warnings = result.warnings
-        if _confidence(result) < self._reliable:
-            bound = self._base
-            warnings = _each_once(warnings + self._warnings)
+        bound = 1.0 if _confidence(result) >= self._reliable else self._base
         probabilities = tuple(min(p, bound) for p in result.probabilities)
+        warnings = _each_once(result.warnings + self._warnings)
         return replace(result, probabilities=probabilities, warnings=warnings)
 
     def _registration(self, tracked: TrackedPose, item: Photograph) -> Registration:
@@ -594,8 +609,18 @@ class Follower:
         )
 
 
-def _each_once(texts: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(texts))
+def _is_lasting(warning: str) -> bool:
+    """Whether a warning is about the camera or the mesh, and holds for other frames too."""
+    return warning.startswith((SHOWN_FOCAL_LENGTH, STRETCHED, MIRROR_WARNING))
+
+
+def _each_once(warnings: Sequence[str]) -> tuple[str, ...]:
+    return tuple(texts[0] for texts in kinds_of(warnings).values())
+
+
+def _bounded(result: Registration) -> float:
+    """Confidence with which frames may follow an answer."""
+    return min(_confidence(result), result.confidence_bound)
 
 
 def _confidence(result: Registration) -> float:

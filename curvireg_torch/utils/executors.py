@@ -66,7 +66,7 @@ class Workers:
         self._executor = executor
         self._processes: _Processes | None = None
         self.generation = 0  # counts the processes that were started together
-        if not isinstance(executor, Executor | None):
+        if executor is not None and not callable(getattr(executor, "submit", None)):
             raise InvalidInputError(
                 f"executor: expected a concurrent.futures.Executor, got {type(executor).__name__}; "
                 f"that of a Dask client is client.get_executor()"

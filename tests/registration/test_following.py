@@ -273,6 +273,7 @@ def test_frames_after_an_answer_that_is_questioned_are_not_reliable_either(monke
 
 def test_a_frame_that_is_less_sure_than_the_one_before_is_checked(monkeypatch):
     """Learned from unchecked, a wrong pose would be tracked with certainty from then on."""
+    monkeypatch.setattr(tracking, "is_calibrated", lambda _: True)
     image, _, T = sequence(2)[1]
     wrong = answer(T @ HALF_TURN, 0.0)
     checks = []
@@ -287,6 +288,51 @@ def test_a_frame_that_is_less_sure_than_the_one_before_is_checked(monkeypatch):
         monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 1.0)
         assert follow(image).reliable == (tracked == 0.91)
     assert checks == [0, 1, 0, 1]
+
+
+def test_frames_that_are_less_sure_are_checked_again_after_8_16_and_32(monkeypatch):
+    monkeypatch.setattr(tracking, "is_calibrated", lambda _: True)
+    image, _, T = sequence(2)[1]
+    follow = follower()
+    follow._base = 0.8
+    monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 1.0)
+    refine = Mock(return_value=answer(T, 0.7))
+    monkeypatch.setattr(tracking, "refine_one", refine)
+    checked = []
+    for number in range(1, 17):
+        follow(image)
+        checked += [number] * (refine.call_count > len(checked))
+    assert checked == [8, 16]
+    refine.return_value = answer(T, 0.97)
+    monkeypatch.setattr(tracking, "FIRST_CHECK", 1)
+    follow._unsure = 31
+    assert follow(image).reliable
+    assert follow(image).confidence == pytest.approx(0.97)
+    assert refine.call_count == 3
+
+
+def test_without_calibration_no_registration_checks_a_tracked_pose(monkeypatch):
+    follow = follower()
+    monkeypatch.setattr(tracking, "is_calibrated", lambda _: False)
+    monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 0.7)
+    monkeypatch.setattr(tracking, "refine_one", None)
+    assert follow(sequence(2)[1][0]).confidence == pytest.approx(0.7)
+
+
+def test_warnings_of_camera_and_mesh_hold_for_later_frames_and_others_do_not(monkeypatch):
+    (image, _, T), *_ = sequence(2)
+    follow = follower()
+    focal, outside = "the photograph shows a focal length of about {} px", "30 % lies outside"
+    monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 0.1)
+    said = []
+    for number in (400, 405):
+        warnings = (focal.format(number), outside)
+        refined = replace(answer(T, 0.95), warnings=warnings)
+        monkeypatch.setattr(tracking, "refine_one", Mock(return_value=refined))
+        said.append(follow(image).warnings)
+    assert said[1] == (focal.format(405), outside)
+    monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 1.0)
+    assert follow(image).warnings == (focal.format(400),)
 
 
 def test_a_refined_pose_of_no_confidence_is_not_followed(monkeypatch):

@@ -152,6 +152,8 @@ def test_a_rotation_that_is_not_determined_is_not_reliable():
             assert judged.reliable == (verdict == "reliable")
             assert judged.verdict == verdict
             assert (judged.confidence_bound < judged.reliable_from) == (not judged.reliable)
+        unsure = replace(result, probabilities=(0.5,), confidence_features={"undetermined": 1.0})
+        assert unsure.confidence_bound < result.reliable_from
     assert registration(confidence=0.5).confidence_bound == 1.0, "its own confidence is a bound"
 
 

@@ -121,11 +121,16 @@ def _yolo_box(numbers: Sequence[float]) -> ImageBox | None:
     x, y, width, height, *more = numbers
     corners = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
     is_whole = numbers[-1] >= 1.0 and numbers[-1] == int(numbers[-1])
-    # else the corners of a triangle, the last of which lies on the border
+    # outside, six numbers are the corners of a triangle, the last of which lies on the border
     is_inside = min(corners) > -BEYOND and max(corners) < 1.0 + BEYOND
     is_box = count < 6 or (count == 6 and is_whole and is_inside)
-    # an even number that ends with 1 is a polygon down to the border, not a score and a track
-    is_track = count > 4 if is_box else count > 8 and (count % 2 == 1 or numbers[-1] > 1.0)
+    # an even number that ends with 1 is a polygon down to the border, not a score and a track,
+    # unless it begins with the corners of an oriented box
+    is_oriented = count == 10 and all(
+        abs(numbers[k] - numbers[k + 2] + numbers[k + 4] - numbers[k + 6]) < 1e-3 for k in (0, 1)
+    )
+    is_polygon = count % 2 == 0 and numbers[-1] == 1.0 and not is_oriented
+    is_track = count > 4 if is_box else count > 6 and not is_polygon
     has_track = is_whole and is_track
     ending = more if is_box else list(numbers)
     track = str(int(ending.pop())) if has_track else ""

@@ -175,27 +175,36 @@ def read_collada(source: MeshSource) -> ReadMesh:
 
 
 def _name_unread(source: MeshSource, root: Any) -> None:
-    """Warn of faces with holes and of transforms that pycollada does not read; those of cameras
-    move no mesh."""
+    """Warn of faces with holes and of transforms that pycollada misreads; those of cameras move no
+    mesh."""
     for one in root.iter():
         children = {local_name(child) for child in one}
         names = {"ph"} if local_name(one) == "polygons" else {"skew", "lookat"}
         for name in sorted(children & names if "instance_camera" not in children else ()):
-            source.warn("parts", f"its elements <{name}> are not read; export triangles at places")
+            text = f"its elements <{name}> are misread; export triangles, with transforms applied"
+            source.warn("parts", text)
 
 
 def _has_filled_gaps(mesh: Any) -> bool:
     """Whether the fan that pycollada makes of a polygon folds back, as of one that is not convex;
     the two sides of a face have the same corners, and are no fold."""
     corners = np.asarray(mesh.triangles)
+    if not len(corners):
+        return False
     first = corners[:-1]
     second = corners[1:]
     is_fan = (first[:, [0, 2]] == second[:, [0, 1]]).all(axis=(1, 2))
     is_fan &= (first[:, 1] != second[:, 2]).any(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     sizes = np.linalg.norm(normals, axis=1)
-    products = (normals[:-1] * normals[1:]).sum(axis=1)
-    return bool((is_fan & (products < -0.99 * sizes[:-1] * sizes[1:])).any())
+    # the largest triangle of its fan shows which way each looks: those beside it may have no area
+    fan = np.concatenate([[0], np.cumsum(~is_fan)])
+    order = np.argsort(sizes)
+    largest = np.zeros(fan[-1] + 1, np.int64)
+    largest[fan[order]] = order
+    other = largest[fan]
+    products = (normals * normals[other]).sum(axis=1)
+    return bool((products < -0.99 * sizes * sizes[other]).any())
 
 
 _GROUPS = ("node", "visual_scene", "library_visual_scenes", "library_nodes")

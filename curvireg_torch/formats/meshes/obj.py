@@ -181,12 +181,16 @@ def _colours(
     point_colours: Bytes | None,
 ) -> SurfaceColours | None:
     library = _libraries(source, list(lines.libraries))
-    lost = [name for name in lines.materials if name not in library]
+    # a remark without a blank may follow a name
+    names = [
+        name if name in library else name.partition(b" #")[0].strip() for name in lines.materials
+    ]
+    lost = [name for name in names if name not in library]
     if lost and lines.libraries and not source.warnings:
-        names = ", ".join(spellings(name)[0] for name in lost[:3])
-        text = f"its MTL files lack the material {names[:100]}; its faces are shown in white"
+        some = ", ".join(spellings(name)[0] for name in lost[:3])
+        text = f"its MTL files lack the material {some[:100]}; its faces are shown in white"
         source.warn("material", text)
-    if point_colours is None and len(lost) == len(lines.materials):
+    if point_colours is None and len(lost) == len(names):
         return None
     painted = SurfaceColours.plain(len(faces))
     if point_colours is not None:
@@ -196,7 +200,7 @@ def _colours(
     has_uv = (uv_index >= 0).all(axis=1)
     order = np.argsort(material, kind="stable")
     starts = np.searchsorted(material[order], np.arange(len(lines.materials)))
-    for name, own in zip(lines.materials, np.split(order, starts)[1:], strict=True):
+    for name, own in zip(names, np.split(order, starts)[1:], strict=True):
         found = library.get(name)
         if found is None or not len(own):
             continue

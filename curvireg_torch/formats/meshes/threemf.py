@@ -132,7 +132,7 @@ class _Package:
             for one in read_xml(self._content(relations)):
                 target = one.get("Target", "")
                 if one.get("Type", "").endswith(f"/{_MODEL}") and self._has(target):
-                    return target
+                    return f"/{target.lstrip('/').lower()}"
         models = [name for name in self._names if name.endswith(".model")]
         if not models:
             raise ValueError("no model in it")

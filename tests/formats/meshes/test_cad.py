@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.testing import assert_allclose
 
 import curvireg_torch as cr
@@ -202,6 +203,17 @@ def test_collada_names_textures_that_it_cannot_use(write, load):
         assert match in " ".join(texts)
 
 
+@pytest.mark.parametrize("first", range(8))
+def test_gaps_of_a_polygon_are_found_from_each_corner(first):
+    """A fan of these corners has triangles without area."""
+    outline = [(0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)]
+    corners = np.pad(np.roll(outline, -first, axis=0), ((0, 0), (0, 1))).astype(float)
+    fan = [(0, k, k + 1) for k in range(1, 7)]
+    assert cad._has_filled_gaps(trimesh.Trimesh(corners, fan, process=False))
+    square = trimesh.Trimesh(corners, process=False, faces=np.zeros((0, 3), int))
+    assert not cad._has_filled_gaps(square)
+
+
 @needs("collada")
 def test_collada_names_polygons_and_transforms_that_it_misreads(write, load):
     write("label.png", encoded(noise()))
@@ -219,9 +231,9 @@ def test_collada_names_polygons_and_transforms_that_it_misreads(write, load):
     assert said("polylist", "<vcount>3 3</vcount><p>0 1 2 0 2 1</p>") == ""
     assert "whose gaps are filled" in said("polylist", "<vcount>4</vcount><p>1 3 2 0</p>")
     hole = "<p>0 1 2</p><ph><p>0 1 2</p><h>0 3 1</h></ph>"
-    assert "elements <ph> are not read" in said("polygons", hole)
+    assert "elements <ph> are misread" in said("polygons", hole)
     skewed = end.replace("<translate>", "<skew>45 0 1 0 1 0 0</skew><translate>")
-    assert "elements <skew> are not read" in said("polygons", "<p>0 1 2</p>", skewed)
+    assert "elements <skew> are misread" in said("polygons", "<p>0 1 2</p>", skewed)
 
 
 @needs("collada")
@@ -428,7 +440,7 @@ def test_urdf_reads_capsules_and_names_other_shapes(tmp_path, load):
     capsule = '<geometry><capsule radius="0.5" length="2"/></geometry>'
     torus = "<geometry><torus/></geometry>"
     mesh, said = load(robot(tmp_path / "a.urdf", capsule, torus))
-    assert_allclose(mesh.extents, [1.0, 1.0, 3.0], atol=1e-6)
+    assert_allclose(mesh.bounds, [[-0.5, -0.5, -1.5], [0.5, 0.5, 1.5]], atol=1e-6)
     assert "its shape torus is not read and is left out" in said[0]
 
 

@@ -77,6 +77,9 @@ def test_names_may_hold_number_signs_and_remarks_stand_behind_them(write, load):
     )
     assert (mesh.colours.corners == [255, 0, 0]).all()
     assert said == []
+    write("a.mtl", "newmtl red\nKd 1 0 0\n")
+    mesh, _ = load(write("a.obj", f"mtllib a.mtl\n{POINTS}usemtl red #lid\n{HALVES[0]}"))
+    assert (mesh.colours.corners == [255, 0, 0]).all()
 
 
 def test_faces_of_a_textured_material_without_coordinates_are_named(write, load, tmp_path):
