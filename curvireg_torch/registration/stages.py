@@ -12,7 +12,7 @@ from ..errors import CurviregError
 from ..evidence import EvidenceWeights
 from ..fitting.edges import EdgeCrops
 from ..geometry.crops import box_share, crop_transforms, square_boxes
-from ..geometry.framing import clipped, hidden_boxes, inside_boxes, whole_boxes
+from ..geometry.framing import clipped, hidden_boxes, whole_boxes
 from ..matching import Ranking
 from ..matching.search import search
 from ..terms import QueryFeatures
@@ -79,8 +79,8 @@ MASK_REACH = 2  # px of it by which a mask may reach beyond the mesh
 # pose are right, and at most 0.89 where the mask is shifted by a fifth of the object
 LEAST_MASK_SHARE = 0.9
 BESIDE_MASK = (
-    "the mask reaches far beyond the object at this pose: check that it is of this object in this "
-    "photograph"
+    "the mask reaches far beyond the object at this pose: check that it is of this object alone, "
+    "and of this photograph"
 )
 VIEWS_OF_HIDDEN = 4  # best views that are tried in each box of an object behind an occluder
 
@@ -185,19 +185,17 @@ def _compared_with_input(
 
 
 def _mask_share(target: Target, item: Photograph, projection: tuple[Tensor, Tensor]) -> float:
-    """Share of a photograph's mask within its box that lies on the mesh at a pose, or near it; 1
-    without one."""
+    """Share of a photograph's mask that lies on the mesh at a pose, or near it; 1 without one."""
     margin = target.describer.settings.margin
     mask = item.mask_crop(MASK_SIZE, margin)
     if mask is None:
         return 1.0
     T, K = projection
-    box = item.box[None].float()
-    transform = crop_transforms(square_boxes(box, margin), MASK_SIZE)
+    transform = crop_transforms(square_boxes(item.box[None].float(), margin), MASK_SIZE)
     size = (MASK_SIZE, MASK_SIZE)
     depth = target.describer.renderer.render(T[None], transform.double() @ K, size)
     near = max_pool2d((depth > 0.0).float().cpu(), 2 * MASK_REACH + 1, 1, MASK_REACH)
-    white = (mask >= 0.5).float() * inside_boxes(box, box, MASK_SIZE, margin)
+    white = (mask >= 0.5).float()
     return float((white * near).sum() / white.sum()) if bool(white.any()) else 1.0
 
 

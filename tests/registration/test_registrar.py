@@ -313,17 +313,6 @@ def test_a_pose_beside_its_mask_is_not_believed(monkeypatch, changed, is_beside)
     assert result.reliable != is_beside
 
 
-def test_a_mask_of_several_copies_is_compared_within_the_box(monkeypatch):
-    sure = replace(truck_answer(), probabilities=(1.0,))
-    mask = render_depth(example_mesh(), TRUTH, CAMERA, SIZE)[0, 0] > 0
-    both = mask | mask.roll(int(BOX[2] - BOX[0]) + 4, 1)
-    monkeypatch.setattr(stages, "register_boxes", lambda _, items: [sure] * len(items))
-    for box, is_beside in ((BOX, False), (None, True)):
-        item = as_photograph(IMAGE, box, CAMERA, mask=both)
-        (result,) = stages.register_photographs(truck_registrar(), [item])
-        assert (stages.BESIDE_MASK in result.warnings) == is_beside
-
-
 @pytest.mark.parametrize(
     ("moved", "is_beside"),
     [
