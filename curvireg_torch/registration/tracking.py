@@ -387,8 +387,7 @@ class Follower:
         self._tracker = Tracker(describer.contours, describer.hull, reliable=self._reliable)
         # confidence of the pose that tracking goes on from, if there is one
         self._base: float | None = None
-        # what registrations have warned of camera and mesh, and frames since the last check while
-        # the confidence is less than of a reliable answer
+        # what registrations have warned of camera and mesh, and frames since the last reliable pose
         self._warnings: tuple[str, ...] = ()
         self._unsure = 0
         # registrations in a row that agree, none of which is believed
@@ -462,7 +461,8 @@ class Follower:
         """Go on with the confidence of an answer, and what it warns of camera and mesh."""
         self._base = confidence
         self._warnings = _each_once((*self._warnings, *filter(_is_lasting, warnings)))
-        self._unsure = 0
+        if confidence >= self._reliable:
+            self._unsure = 0
 
     @torch.no_grad()
     def __call__(

@@ -290,25 +290,26 @@ def test_a_frame_that_is_less_sure_than_the_one_before_is_checked(monkeypatch):
     assert checks == [0, 1, 0, 1]
 
 
-def test_frames_that_are_less_sure_are_checked_again_after_8_16_and_32(monkeypatch):
+@pytest.mark.parametrize("refined", [0.7, 0.85])
+def test_frames_that_are_less_sure_are_checked_again_after_8_16_and_32(monkeypatch, refined):
     monkeypatch.setattr(tracking, "is_calibrated", lambda _: True)
     image, _, T = sequence(2)[1]
     follow = follower()
     follow._base = 0.8
     monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 1.0)
-    refine = Mock(return_value=answer(T, 0.7))
+    refine = Mock(return_value=answer(T, refined))
     monkeypatch.setattr(tracking, "refine_one", refine)
     checked = []
-    for number in range(1, 17):
+    for number in range(1, 33):
         follow(image)
         checked += [number] * (refine.call_count > len(checked))
-    assert checked == [8, 16]
+    assert checked == [8, 16, 32]
     refine.return_value = answer(T, 0.97)
     monkeypatch.setattr(tracking, "FIRST_CHECK", 1)
-    follow._unsure = 31
+    follow._unsure = 63
     assert follow(image).reliable
     assert follow(image).confidence == pytest.approx(0.97)
-    assert refine.call_count == 3
+    assert refine.call_count == 4
 
 
 def test_without_calibration_no_registration_checks_a_tracked_pose(monkeypatch):
