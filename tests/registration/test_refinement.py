@@ -1,6 +1,8 @@
 """Refinement of known poses: a start near the truth ends at the truth, and an object that is not
 there is lost."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 import trimesh
@@ -111,6 +113,23 @@ def test_refine_calls_the_object_lost_below_its_limit(monkeypatch, confidence, o
     monkeypatch.setattr(refinement, "refinement_confidence", lambda _: confidence)
     image, _, T = scene(0)
     assert truck_registrar().refine([image], CAMERA, [T])[0].ok is ok
+
+
+@pytest.mark.parametrize(("contradiction", "reliable"), [(None, True), ("better outside", False)])
+def test_what_makes_the_registration_unsure_makes_the_refined_pose_unsure(
+    monkeypatch, contradiction, reliable
+):
+    image, _, T = scene(0)
+    register = refinement.register
+
+    def questioned(*given):
+        (found,) = register(*given)
+        sure = (1.0,) + (0.0,) * (len(found.hypotheses) - 1)
+        return [replace(found, probabilities=sure, prior_contradiction=contradiction)]
+
+    monkeypatch.setattr(refinement, "register", questioned)
+    monkeypatch.setattr(refinement, "refinement_confidence", lambda _: 1.0)
+    assert learned_registrar().refine([image], CAMERA, [T])[0].reliable == reliable
 
 
 @pytest.mark.slow

@@ -311,6 +311,9 @@ def test_a_pose_beside_its_mask_is_not_believed(monkeypatch, changed, is_beside)
     (result,) = stages.register_photographs(truck_registrar(), [item])
     assert (stages.BESIDE_MASK in result.warnings) == is_beside
     assert result.reliable != is_beside
+    monkeypatch.setattr(Registrar, "is_exact", False)
+    (similar,) = stages.register_photographs(truck_registrar(), [item])
+    assert similar.reliable, "the mask is that of another shape"
 
 
 @pytest.mark.parametrize(
