@@ -186,6 +186,7 @@ def test_pose_errors_contract(error):
     assert_close(single.double(), whole, rtol=1e-3, atol=1e-5)
     half = EST.half()
     assert torch.equal(error(half, GT, POINTS), error(half.double(), GT, POINTS))
+    assert error(half, half, POINTS.half()).dtype == torch.float32
     # would map every point to the origin, which may be close to the surface
     zero = torch.zeros_like(EST)
     for est, gt, points, message in (
