@@ -319,8 +319,8 @@ class Tracker:
 # better
 TRUSTED_CONFIDENCE = 0.5
 KEPT_CONFIDENCE = 0.2
-# Frames after which one that is trusted, and less sure than a reliable answer, is checked again;
-# then after twice as many, and so on
+# Frames since the last reliable pose after which a trusted one is checked again; then after twice
+# as many, and so on
 FIRST_CHECK = 8
 # Confidence of a registration from which its pose is followed
 BELIEVED_CONFIDENCE = 0.5
@@ -517,8 +517,9 @@ class Follower:
         )
 
     def _is_trusted(self, tracked: TrackedPose, found: Registration) -> bool:
-        """Whether a tracked pose stands without a refinement: in the next frame the tracker, which
-        learns from it, finds even a wrong one with certainty."""
+        """Whether a tracked pose stands without a refinement; counts the frames without a reliable
+        pose. In the next frame the tracker, which learns from it, finds even a wrong one with
+        certainty."""
         assert self._base is not None
         if _confidence(found) < TRUSTED_CONFIDENCE:
             return False

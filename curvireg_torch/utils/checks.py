@@ -283,7 +283,7 @@ def as_tensor(values: Any, name: str) -> Any:
         is_float8 = x.is_floating_point() and x.element_size() == 1
         if is_float8 or x.layout != torch.strided:
             raise InvalidInputError(
-                f"{name}: expected a dense tensor, not of float8, got {x.layout} of {x.dtype}; "
+                f"{name}: expected a dense tensor that is not float8, got {x.layout} of {x.dtype}; "
                 f"convert with to_dense() or float()"
             )
     return x

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 import warnings
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -36,7 +36,7 @@ def refused(_, tasks):
     raise InvalidInputError("cannot be used", subject=str(tasks))
 
 
-class InlineExecutor(Executor):
+class InlineExecutor:
     """An executor of this process, whose worker is lost with the tasks in ``ends``."""
 
     def __init__(self, ends=(), error=RuntimeError):
