@@ -190,6 +190,11 @@ class Tracker:
         """(1, 4, 4) of the last frame."""
         return self._poses[-1]
 
+    @property
+    def distance(self) -> float:
+        """Of the object's centre in the last frame."""
+        return float(point_in_cameras(self.last_pose, self.centre).norm())
+
     def predictions(self) -> list[Tensor]:
         """Starts (1, 4, 4) for the next frame: the last pose, turned and moved on as before, and
         the last pose."""
@@ -322,6 +327,9 @@ KEPT_CONFIDENCE = 0.2
 # Frames since the last reliable pose after which a trusted one is checked again; then after twice
 # as many, and so on
 FIRST_CHECK = 8
+# Factor between the distance and that of the last check, from which a trusted pose is checked
+# again: instead, the lens may have zoomed
+CHECKED_ZOOM = 1.15
 # Confidence of a registration from which its pose is followed
 BELIEVED_CONFIDENCE = 0.5
 # Successive registrations that agree are followed from KEPT_CONFIDENCE on
@@ -342,9 +350,10 @@ class Follower:
     The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and
     10 % of the distance of the truth: the tracker's own, times that of the last pose that a
     registration confirmed. If that registration is not reliable, the frames that follow are not
-    either; they are checked again after 8 frames, 16, 32 and so on. What it warns of camera and
-    mesh holds for all later frames. No pose gains confidence from being followed, unless a further
-    registration is reliable.
+    either; they are checked again after 8 frames, 16, 32 and so on. A frame whose distance has
+    changed by 15 % is checked too: the lens may have zoomed. What a registration warns of camera
+    and mesh holds for all later frames. No pose gains confidence from being followed, unless a
+    further registration is reliable.
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
@@ -390,6 +399,8 @@ class Follower:
         # what registrations have warned of camera and mesh, and frames since the last reliable pose
         self._warnings: tuple[str, ...] = ()
         self._unsure = 0
+        # distance of the object when it was last checked
+        self._distance = math.nan
         # registrations in a row that agree, none of which is believed
         self._agreeing: list[Tensor] = []
 
@@ -457,12 +468,17 @@ class Follower:
         self._tracker.start(item.image, item.K, T)
         self._confirm(confidence, warnings)
 
-    def _confirm(self, confidence: float, warnings: Sequence[str]) -> None:
+    def _confirm(self, confidence: float, warnings: Sequence[str] = ()) -> None:
         """Go on with the confidence of an answer, and what it warns of camera and mesh."""
         self._base = confidence
-        self._warnings = _each_once((*self._warnings, *filter(_is_lasting, warnings)))
+        self._distance = self._tracker.distance
+        self._warn(warnings)
         if confidence >= self._reliable:
             self._unsure = 0
+
+    def _warn(self, warnings: Sequence[str]) -> None:
+        """Keep, of the warnings of an answer, those that hold for later frames too."""
+        self._warnings = _each_once((*self._warnings, *filter(_is_lasting, warnings)))
 
     @torch.no_grad()
     def __call__(
@@ -505,12 +521,12 @@ class Follower:
                 self._tracker.accept(
                     self._tracker.measure(item.image, item.K, refined.projection[0])
                 )
-                self._confirm(_bounded(refined), refined.warnings)
+                self._confirm(_bounded(refined))
             return refined
         if tracked and found and _confidence(found) >= KEPT_CONFIDENCE:
             self._tracker.accept(tracked)
             self._base = _confidence(found)
-            return found
+            return replace(found, warnings=_each_once(found.warnings + self._warnings))
         registered = self._registered(image, box, self._reliable)
         return (
             registered if isinstance(registered, Registration) and registered.reliable else refined
@@ -525,6 +541,9 @@ class Follower:
             return False
         if not is_calibrated(self.registrar.pipeline):  # nothing can confirm it
             return True
+        if not 1.0 / CHECKED_ZOOM < found.distance / self._distance < CHECKED_ZOOM:
+            self._distance = found.distance
+            return False
         if self._base >= self._reliable:
             return tracked.confidence >= self._reliable
         self._unsure += 1
@@ -568,7 +587,8 @@ class Follower:
         return len(self._agreeing) >= AGREEING_FRAMES
 
     def _refined(self, item: Photograph, starts: Tensor) -> Registration | FailedRegistration:
-        """Refined poses; a registration that is not reliable does not raise the confidence."""
+        """Refined poses, whose warnings hold for later frames too; a registration that is not
+        reliable does not raise the confidence."""
         try:
             result = refine_one(self.registrar, item, starts)
         except CurviregError as error:
@@ -576,6 +596,7 @@ class Follower:
         assert self._base is not None
         bound = 1.0 if _confidence(result) >= self._reliable else self._base
         probabilities = tuple(min(p, bound) for p in result.probabilities)
+        self._warn(result.warnings)
         warnings = _each_once(result.warnings + self._warnings)
         return replace(result, probabilities=probabilities, warnings=warnings)
 

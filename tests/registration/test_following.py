@@ -336,6 +336,35 @@ def test_warnings_of_camera_and_mesh_hold_for_later_frames_and_others_do_not(mon
     assert follow(image).warnings == (focal.format(400),)
 
 
+def zoomed(image, factor):
+    """The middle of an image, enlarged."""
+    H, W = SIZE
+    h, w = round(H / factor), round(W / factor)
+    y, x = (H - h) // 2, (W - w) // 2
+    middle = image[None, :, y : y + h, x : x + w]
+    return torch.nn.functional.interpolate(middle, SIZE, mode="bilinear")[0]
+
+
+@pytest.mark.parametrize(("factor", "checks"), [(1.1, [0, 0]), (1.25, [1, 1])])
+def test_a_pose_at_another_distance_is_checked_once_for_another_zoom(monkeypatch, factor, checks):
+    """The tracker is as certain as before, and the registration, which is not, is not followed."""
+    monkeypatch.setattr(tracking, "is_calibrated", lambda _: True)
+    monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 1.0)
+    warning = "the photograph shows a focal length of about 400 px"
+    follow = follower()
+    counted = []
+    frames = sequence(3)[1:]
+    refined = replace(answer(frames[0][2], 0.6), warnings=(warning,))
+    refine = Mock(return_value=refined)
+    monkeypatch.setattr(tracking, "refine_one", refine)
+    for image, _, _ in frames:
+        result = follow(zoomed(image, factor))
+        counted.append(refine.call_count)
+        assert result.confidence == 1.0
+        assert result.warnings == (warning,) * counted[0]
+    assert counted == checks
+
+
 def test_a_refined_pose_of_no_confidence_is_not_followed(monkeypatch):
     """It would bound all later ones, so that no frame were registered again."""
     image, box, T = sequence(2)[1]
