@@ -9,8 +9,9 @@
 the same from most sides; ``shelf``, several printed packages side by side, all annotated. --models
 packages or shapes are there to choose from; a shelf has --objects LOW HIGH of them. A scene has one
 photograph, or one for each of --cameras, or --frames of a moving camera. --cut LOW HIGH puts a
-fraction of the object outside the photograph; --occlusion is the largest hidden fraction of a
-target, --bare the fraction of the objects that get one uniform colour. To calibrate confidence,
+fraction of the object outside the photograph; of a target that does not stand on a shelf
+--occlusion LOW HIGH is hidden; --motion LOW HIGH is the size of motion blur, in px; --bare is the
+fraction of the objects that get one uniform colour. To calibrate confidence,
 --cad annotates an object as another one: similar, of its kind; wrong, any other; print, a package
 of the same shape with another print; mirrored, a tied shape's mirror image; variant, the shape with
 one part folded, moved, left out, or of another size. Scene i depends only on the seed, --models and
@@ -40,7 +41,17 @@ from scripts._shared import Record, in_processes, read_json, run, write_json
 from scripts.scenes.families import FAMILIES, random_shape
 from scripts.scenes.materials import random_texture
 from scripts.scenes.packages import package
-from scripts.scenes.scene import SIZE, Scene, View, camera_path, cut, shelf, simulate_camera, single
+from scripts.scenes.scene import (
+    SIZE,
+    Scene,
+    View,
+    camera_path,
+    cut,
+    motion_blur,
+    shelf,
+    simulate_camera,
+    single,
+)
 from scripts.scenes.surfaces import Array, Rng, middle_of
 from scripts.scenes.textured import Placed, TexturedMesh, plain_texture
 from scripts.scenes.tied import FAMILIES as TIED_FAMILIES
@@ -53,6 +64,7 @@ TWINS = ("print", "mirrored", "variant")
 
 TWIN = 100_000
 ATTEMPTS = 60  # at a scene of which little enough is hidden
+COARSE = 5  # times smaller, a picture from which an attempt is given up
 MIN_PIXELS = 400  # of a silhouette; smaller ones are not annotated
 PART_AREA = (0.08, 0.5)  # fraction of the surface that differs in a variant
 # factor between the proportions of similar objects; if none is within it, the closest is taken
@@ -353,7 +365,7 @@ def full_shelf(objects: Packages, options: Namespace, rng: Rng) -> tuple[Scene, 
         list(annotated.values()),
         objects.texture,
         rng,
-        occlusion=options.occlusion,
+        occlusion=options.occlusion[1],
         cameras=options.cameras,
     )
     return scene, annotated
@@ -379,7 +391,7 @@ def lone_object(
         objects.texture,
         rng,
         upright=index % 2 == 0,
-        occluded=rng.random() < 0.3 and attempt < 12,
+        occluded=(rng.random() < 0.3 and attempt < 12) or options.occlusion[0] > 0.0,
         cameras=options.cameras,
     )
     named = shown
@@ -407,15 +419,18 @@ def make_scene(objects: Packages, options: Namespace, index: int) -> None:
         return
     for attempt in range(ATTEMPTS):
         scene, annotated = compose(objects, options, index, attempt)
+        if options.occlusion[0] > 0.0 and hidden_of(scene) < options.occlusion[0]:
+            continue
         pictures = [scene.render(view, SIZE) for view in scene.views]
         seen = np.array([picture.seen.sum(axis=(1, 2)) for picture in pictures])
         whole = np.array([picture.whole.sum(axis=(1, 2)) for picture in pictures])
         hidden = 1.0 - seen / np.maximum(whole, 1)
-        in_sight = options.kind == "shelf" or hidden.max() <= options.occlusion
+        low, high = options.occlusion
+        in_sight = options.kind == "shelf" or low <= hidden.min() <= hidden.max() <= high
         if in_sight and (whole[:, 0] >= MIN_PIXELS).all():
             break
     else:
-        raise RuntimeError(f"scene {index}: too much is hidden in every attempt")
+        raise RuntimeError(f"scene {index}: --occlusion is missed by every attempt")
     part = folder.with_suffix(".part")
     shutil.rmtree(part, ignore_errors=True)
     (part / "rgb").mkdir(parents=True)
@@ -424,7 +439,11 @@ def make_scene(objects: Packages, options: Namespace, index: int) -> None:
     cameras = {}
     for k, (view, picture) in enumerate(zip(scene.views, pictures, strict=True)):
         seed = (options.seed, index, 0 if options.frames > 1 else k)  # one camera takes all frames
-        image = simulate_camera(picture.linear, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        linear = picture.linear
+        if options.motion:
+            linear = motion_blur(linear, rng.integers(*options.motion), rng)
+        image = simulate_camera(linear, rng)
         cv2.imwrite(str(part / "rgb" / f"{k:06d}.png"), image[..., ::-1])
         cameras[k] = camera_row(scene, view)
         truths[k] = []
@@ -437,6 +456,15 @@ def make_scene(objects: Packages, options: Namespace, index: int) -> None:
     for name, content in (("gt", truths), ("camera", cameras), ("gt_info", infos)):
         write_json(part / f"scene_{name}.json", content)
     part.rename(folder)
+
+
+def hidden_of(scene: Scene) -> float:
+    """Fraction of the first object that is hidden in the first view, from a small picture of it."""
+    R, t, K = scene.views[0]
+    shrink = np.diag([1.0 / COARSE, 1.0 / COARSE, 1.0])
+    H, W = SIZE
+    picture = scene.render((R, t, shrink @ K), (H // COARSE, W // COARSE))
+    return 1.0 - picture.seen[0].sum() / max(picture.whole[0].sum(), 1)
 
 
 def camera_row(scene: Scene, view: View) -> Record:
@@ -515,8 +543,9 @@ def main(
     cad: Literal["exact", "similar", "wrong", "print", "mirrored", "variant"] = "exact",
     bare: float = 0.0,
     objects: tuple[int, int] = (8, 20),
-    occlusion: float = 0.6,
+    occlusion: tuple[float, float] = (0.0, 0.6),
     cut: tuple[float, float] | None = None,
+    motion: tuple[int, int] | None = None,
     cameras: int = 1,
     frames: int = 1,
     jobs: int = 1,
@@ -534,7 +563,7 @@ def main(
     kept["meshes"] = meshes and str(meshes)
     kept["groups"] = {obj_id: known.group(obj_id % TWIN) for obj_id in ids}
     write_json(out / "benchmark.json", kept)
-    print(f"{write_targets(out, occlusion)} targets in {count} scenes in {out}")
+    print(f"{write_targets(out, occlusion[1])} targets in {count} scenes in {out}")
 
 
 if __name__ == "__main__":
