@@ -399,6 +399,8 @@ def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
     assert "--camera 300 300.5 119.5 89.5 --unit" in session.command()
     session.set_camera(65.0)
     assert "--box 10 20.5 90 80 --fov 65 --unit" in session.command()
+    session.set_camera(UNCERTAIN)
+    assert session.command() == "", "four numbers would be those of a known focal length"
     session.options = replace(session.options, unit="m", camera=180.0)
     session.open_mesh(folder / "truck.ply")
     with refused("180"):
