@@ -93,7 +93,8 @@ class Tally:
         if self.seconds_after_first > 0.0:
             rate = f", {(self.frames - 1) / self.seconds_after_first:.1f} frames per second"
         camera = f"; {self.camera}" if self.camera else ""
-        return f"{self.frames} frames: {verdict_counts(self.counts)}{rate}{camera}"
+        frames = f"{self.frames} frame{'s' * (self.frames != 1)}"
+        return f"{frames}: {verdict_counts(self.counts)}{rate}{camera}"
 
 
 def follow(arguments: argparse.Namespace, *, live: bool) -> None:
@@ -214,6 +215,8 @@ def _poses(
             if follow is None and options.boxes is None:
                 raise  # it would fail in each frame
             result = FailedRegistration(error)
+        if isinstance(result, FailedRegistration):
+            result = FailedRegistration(result.error.with_image_names([name]))
         yield name, image, result, time.perf_counter() - begun
 
 

@@ -110,7 +110,7 @@ def register_several(
         source = [str(path.resolve()) for path in options.photos]
         is_measured = not isinstance(options.camera, str | float | None)
         given = ["--box"] * (options.box is not None) + ["--camera"] * is_measured
-        if given:
+        if given and len(photos) > 1:
             print(f"{' and '.join(given)}: used for all {len(photos)} photographs", file=sys.stderr)
     else:
         photos = read_list(arguments.list, options)

@@ -11,7 +11,7 @@ from trimesh.transformations import quaternion_matrix
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.arrays import Floats
-from ..utils.choices import listed
+from ..utils.choices import UNITS, listed
 from ..utils.files import check_table_size, finite_numbers, split_name
 from .cameras.record import Record, flattened
 from .documents import read_document
@@ -35,7 +35,7 @@ class PoseRecord:
 
     Attributes:
         T: (4, 4) float64 model -> OpenCV camera, finite; its rotation is not checked.
-        unit: of the translation, "m" or "mm", where the format fixes it; None: that of the mesh.
+        unit: of the translation, where the format or the file says it; None: that of the mesh.
         confidence: of the pose, if the file has one.
     """
 
@@ -91,7 +91,7 @@ def _pose_of(content: Any, name: str, mesh: str) -> PoseRecord:
     for name in _MATRIX_NAMES.split():
         numbers = flattened(record.get(name))
         if len(numbers) in (12, 16):
-            return PoseRecord(_pose_matrix(numbers), None, _confidence(record))
+            return PoseRecord(_pose_matrix(numbers), _own_unit(record), _confidence(record))
     return _rotation_and_translation(record)
 
 
@@ -185,7 +185,13 @@ def _rotation_and_translation(record: Record) -> PoseRecord:
         raise InvalidInputError(f"no {missing}; expected {FORMATS}")
     R = _numbers(rotation, "rotation", 9)
     t = _numbers(translation, "translation", 3)
-    return PoseRecord(_transform(R, t), None, _confidence(record))
+    return PoseRecord(_transform(R, t), _own_unit(record), _confidence(record))
+
+
+def _own_unit(record: Record) -> str | None:
+    """The unit that a result of this library states; other files may mean something else by it."""
+    unit = record.get("unit")
+    return unit if record.has("schema") and isinstance(unit, str) and unit in UNITS else None
 
 
 def _confidence(record: Record) -> float | None:

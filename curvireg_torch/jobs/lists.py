@@ -237,7 +237,7 @@ class Counts:
 
     def __str__(self) -> str:
         total = sum(self.verdicts.values())
-        return f"{total} photographs: {verdict_counts(self.verdicts)}"
+        return f"{total} photograph{'s' * (total != 1)}: {verdict_counts(self.verdicts)}"
 
 
 def register_list(

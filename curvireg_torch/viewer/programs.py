@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ..jobs.options import QUALIFIERS, RegisterOptions
+from ..jobs.photograph import RegisteredPhotograph
+from ..registration.photograph import Photograph
 from .shot import Shot
 
 _OPTIONS = (
@@ -54,13 +56,15 @@ def python_program(shot: Shot, name: Callable[[Path], str]) -> str:
     if result.photographs:
         call = [
             registrar,
-            f"cameras = {[row['camera']['matrix'] for row in rows]}",
+            f"cameras = [{', '.join(map(_camera, result.photographs))}]",
             f"T_cam_from_world = {[row['T_cam_from_world'] for row in rows]}",
             f"photos, boxes = [{', '.join(photos)}], {list(boxes)}",
             "result = registrar.register_views(photos, boxes, cameras, T_cam_from_world)",
         ]
     else:
-        given = _given(box=request.box, camera=result.document["inputs"]["camera"])
+        assert isinstance(result.registration, RegisteredPhotograph)
+        camera = _camera(result.registration.photograph)
+        given = _given(box=request.box) + (f", camera={camera}" if camera else "")
         given += "" if prior is None else f", prior=cr.PosePrior(**{prior.to_dict()})"
         if of_registrar or of_parts or is_bank:
             call = [registrar, f"result = cr.register({photos[0]}, registrar{given})"]
@@ -78,6 +82,21 @@ def python_program(shot: Shot, name: Callable[[Path], str]) -> str:
         ),
     ]
     return "\n".join([*lines, "print(pose)", ""])
+
+
+def _camera(photograph: Photograph) -> str:
+    """The camera of a photograph, without distortion, as Python; empty for one that is found again:
+    by the EXIF data, or estimated."""
+    camera = photograph.camera
+    if camera is None or camera.source == "exif":
+        return ""
+    K = camera.matrix
+    numbers = [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    matrix = f"cr.camera_matrix({', '.join(map(str, numbers))})"
+    if not camera.focal_deviation:
+        return matrix
+    source = ", source='estimated'" if photograph.has_estimated_camera else ""
+    return f"cr.Camera({matrix}, focal_deviation={camera.focal_deviation}{source})"
 
 
 def _given(**values: Any) -> str:

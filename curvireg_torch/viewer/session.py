@@ -385,11 +385,13 @@ class Session:
 
     def command(self) -> str:
         """The command line that gives the same result; none takes the box of an undistorted
-        photograph, or boxes and photographs that a rig does not have."""
+        photograph, four numbers whose focal length is uncertain, or boxes and photographs that a
+        rig does not have."""
         if self.shot.view is None:
-            return (
-                "" if self.shot.is_undistorted else command_line(self.request(), self.usable_name)
-            )
+            camera = self.options.camera
+            is_uncertain = isinstance(camera, Camera) and camera.focal_deviation > 0.0
+            has_command = not (is_uncertain or self.shot.is_undistorted)
+            return command_line(self.request(), self.usable_name) if has_command else ""
         shots = self.together()
         if (
             self.rig_path is None

@@ -67,6 +67,10 @@ UNDISTORTED = (
     "None: the command line takes the box in the photograph as it was taken, the page in the "
     "undistorted one."
 )
+UNCERTAIN = (
+    "None: four numbers do not tell how uncertain the calibration's focal length is; give its file "
+    "as --camera FILE."
+)
 NOT_IN_RIG = (
     "None: first write the boxes that were drawn here into the columns x0 to y1 of the rig, and "
     "open all photographs."
@@ -310,7 +314,10 @@ class Inputs(Panel):
         """Show what changed in the session since the last time, here or in another window."""
         session = self.session
         view = self.session.shot.view
-        set_text(self.command, session.command() or (UNDISTORTED if view is None else NOT_IN_RIG))
+        reason = NOT_IN_RIG
+        if view is None:
+            reason = UNDISTORTED if session.shot.is_undistorted else UNCERTAIN
+        set_text(self.command, session.command() or reason)
         set_text(self.python, "" if session.shot.answer is None else session.python())
         for name, select in self.selects.items():
             if select.value != getattr(session.options, name):

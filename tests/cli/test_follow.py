@@ -18,11 +18,12 @@ from curvireg_torch import data
 from curvireg_torch.cli import following, main
 from curvireg_torch.cli.following import Tally
 from curvireg_torch.data import Photo, Video
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.formats.poses import PoseRecord
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.jobs.outputs import MARKER
-from curvireg_torch.registration import Follower
+from curvireg_torch.registration import FailedRegistration, Follower
 from curvireg_torch.visualization import OverlayVideo
 from tests._support import (
     double,
@@ -385,9 +386,19 @@ def test_follow_and_lists_do_not_overwrite_each_other(follow, tmp_path, capsys):
     assert (tmp_path / "results.csv").read_text() == "of others"
 
 
+def test_an_error_names_the_frame(frames, follow, tmp_path, capsys, monkeypatch):
+    failed = FailedRegistration(InvalidInputError("too small").of_image(0))
+    monkeypatch.setattr(Follower, "__call__", lambda *_: failed)
+    assert follow() == 2
+    names = [str(frames[0] / "shots" / f"{k}.png") for k in range(3)]
+    assert [row["message"] for row in table(tmp_path)][:3] == [f"{n}: too small" for n in names]
+    assert f"the first: {names[0]}: too small" in capsys.readouterr().err
+
+
 def test_the_message_of_a_tally_is_that_of_the_first_frame():
     tally = Tally()
-    for message in ("first", "second"):
+    for message, counted in (("first", "1 frame: "), ("second", "2 frames: ")):
         tally.add({"verdict": "failed", "message": message}, 0.0)  # as a coarse clock has it
+        assert str(tally).startswith(counted)
     assert (tally.first_message, tally.frames) == ("first", 2)
     assert str(tally) == "2 frames: 0 reliable, 0 unsure, 0 no match, 0 lost, 2 failed"

@@ -174,6 +174,15 @@ def test_list_has_limits_of_each_row(register_list, tmp_path):
             assert found == {"elevation": [-10, 80]} | expected
 
 
+def test_a_photograph_that_is_named_twice_is_one(folder, register, tmp_path, capsys):
+    photo = tmp_path / "photo.png"
+    photo.write_bytes(b"no photograph")
+    register(photo, photo, folder / "truck.safetensors", "--box", *box_of(0))
+    printed = capsys.readouterr()
+    assert "1 photograph: 0 reliable, 0 unsure, 0 no match, 0 lost, 1 failed" in printed.out
+    assert "used for all" not in printed.err
+
+
 def test_register_files_folders_and_patterns(folder, register, document, refused, tmp_path, capsys):
     photos = folder / "photos"
     bank = (folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA)

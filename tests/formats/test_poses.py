@@ -49,6 +49,15 @@ def test_json(read, content):
     check(read(content))
 
 
+@pytest.mark.parametrize("pose", [MINE, {"T_cam_from_model": T.tolist()}], ids=["R t", "T"])
+def test_a_result_states_its_unit(read, pose):
+    check(read({"schema": 1, "unit": "in", **pose}), "in")
+    for fields in ({"unit": "in"}, {"schema": 1}, {"schema": 1, "unit": None}):
+        check(read({**fields, **pose}))
+    for unit in ("ell", ["in"]):
+        check(read({"schema": 1, "unit": unit, **pose}))
+
+
 def test_text_of_numpy_and_arrays(tmp_path):
     for matrix in (T, T[:3], T.T):
         np.savetxt(tmp_path / "pose.txt", matrix)

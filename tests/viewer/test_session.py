@@ -4,6 +4,7 @@ needed."""
 import io
 import json
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,10 +29,15 @@ from curvireg_torch.viewer import session as module
 from curvireg_torch.viewer import shot as shot_module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.shot import dragged_box
-from tests._support import double, refused, scene, write_photo
+from tests._support import double, refused, scene, slow_after, write_photo
 from tests._support.exif import exif, with_exif
 from tests._support.tables import text_table
 
+UNCERTAIN = Camera(
+    [[260.0, 0.0, 119.5], [0.0, 260.0, 89.5], [0.0, 0.0, 1.0]],
+    focal_deviation=0.1,
+    source="estimated",
+)
 VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
 
 
@@ -209,6 +215,26 @@ def test_the_python_program_gives_the_same_numbers(session, registered):
     assert ", renderer='embree', device='cuda')" in session.python()
 
 
+@pytest.mark.parametrize("camera", slow_after(1, [UNCERTAIN, 49.6, "exif"]))
+def test_the_python_program_knows_how_uncertain_the_focal_length_is(session, registered, camera):
+    folder = registered[1]
+    box = session.shot.box
+    shutil.copy(folder / "photo.png", folder / "exif.png")
+    with_exif(folder / "exif.png", exif(1, 38))
+    session.open_photo(folder / "exif.png").set_box(box)
+    session.set_camera(camera)
+    session.register()
+    names = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CURVIREG_CACHE", str(folder / "cache"))
+        exec(session.python(), names)
+    found, expected = names["result"], session.shot.result.registration
+    covariances = [one.hypotheses[0].covariance for one in (found, expected)]
+    assert_close(*covariances, rtol=1e-3, atol=0.0)
+    assert covariances[0].isfinite().all()
+    assert found.camera.describe() == expected.camera.describe()
+
+
 def test_the_python_program_says_what_boxes_are():
     options = RegisterOptions(pose="upright", box_is="visible")
     made = programs._pipeline(options)
@@ -373,6 +399,8 @@ def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
     assert "--camera 300 300.5 119.5 89.5 --unit" in session.command()
     session.set_camera(65.0)
     assert "--box 10 20.5 90 80 --fov 65 --unit" in session.command()
+    session.set_camera(UNCERTAIN)
+    assert session.command() == "", "four numbers would be those of a known focal length"
     session.options = replace(session.options, unit="m", camera=180.0)
     session.open_mesh(folder / "truck.ply")
     with refused("180"):
