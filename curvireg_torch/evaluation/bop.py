@@ -1,5 +1,6 @@
 """BOP sets: poses, their errors and the file of results for the BOP challenge."""
 
+import os
 import re
 import warnings
 from collections import Counter, defaultdict
@@ -169,7 +170,7 @@ class BOPBenchmark(Benchmark):
     def results_name(self, settings: Row) -> str:
         """METHOD_DATASET-SPLIT.csv, which bop_toolkit takes apart at these signs."""
         method = f"curvireg-{settings.get('preset', 'custom')}"
-        dataset = re.sub("[_-]", "", self.dataset.root.resolve().name)
+        dataset = re.sub("[_-]", "", Path(os.path.abspath(self.dataset.root)).name)
         return f"{method}_{dataset}-{self.dataset.split.replace('_', '-')}.csv"
 
     def subsets(self, samples: Rows) -> dict[str, list[bool]]:

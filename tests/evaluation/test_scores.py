@@ -341,6 +341,8 @@ def test_bop_errors_are_of_the_models_of_the_challenge(instances, tmp_path):
 @pytest.mark.parametrize(("folder", "name"), [("lm", "lm"), ("my-own_set", "myownset")])
 def test_results_have_the_name_that_the_toolkit_takes_apart(bop, tmp_path, out, folder, name):
     benchmark = BOPBenchmark(bop, ANY)
+    bop.root.rename(tmp_path / "stored")
+    (tmp_path / folder).symlink_to("stored")
     bop.root = tmp_path / folder
     bop.split = "test_primesense"
     out.mkdir()
