@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from ..errors import InvalidInputError, MissingFileError
-from ..utils.files import read_csv, read_json
+from ..utils.files import read_csv, read_json, without_apostrophe
 from .registry import DATASETS
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ def read_run(folder: Path) -> Run:
     path = _existing(folder / "errors.csv")
     header, *rows = read_csv(path) or [[]]
     try:
-        errors = {row[0]: _numbers(header[2:], row[2:]) for row in rows}
+        errors = {without_apostrophe(row[0]): _numbers(header[2:], row[2:]) for row in rows}
     except (ValueError, IndexError) as error:
         raise InvalidInputError(f"damaged ({error}); {ADVICE}", subject=path) from error
     return Run(

@@ -129,6 +129,11 @@ def test_objects_of_unknown_pose_do_not_count(tmp_path):
         assert (each.n, math.isnan(each.a)) == (0, True)
 
 
+def test_keys_are_those_of_the_results(tmp_path):
+    run = read_run(write_run(tmp_path, {"'-cup/0": 5, "'=cup/0": 5, "'tis/0": 5}))
+    assert list(run.errors) == ["-cup/0", "=cup/0", "'tis/0"]
+
+
 def test_the_command_prints_rows_for_tables(runs, capsys):
     assert main(["compare", *map(str, runs)]) == 0
     printed = capsys.readouterr().out
