@@ -248,7 +248,7 @@ def _how(run: Run, other: Run) -> str:
 
 def _named(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings by name; those within others as in ``pipeline.box_jitter``."""
-    named = {}
+    named: dict[str, Any] = {}
     for name, value in settings.items():
         inner = _named(value) if isinstance(value, dict) else {}
         named |= {f"{name}.{key}": each for key, each in inner.items()} or {name: value}
