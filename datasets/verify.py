@@ -11,22 +11,29 @@ skips). 2: unusable.
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 from torch.utils.data import Dataset
 
 from curvireg_torch.data import read_image
+from curvireg_torch.data.bop_models import model_files
 from curvireg_torch.errors import CurviregError
+from curvireg_torch.evaluation.bop import read_points
 from curvireg_torch.evaluation.registry import DATASETS, DatasetSpec
+from curvireg_torch.mesh import load_mesh
 
 DEFECTS = ("missing_", "corrupt_", "bad_")
 
 
-def unreadable(dataset: Dataset) -> list[str]:
-    """Errors of the photographs that cannot be decoded."""
+def unreadable(paths: Iterable[str | Path], read: Callable[[str | Path], Any]) -> list[str]:
+    """Errors of the files that cannot be read."""
     problems = []
-    for path in sorted({dataset.annotation(i)["image_path"] for i in range(len(dataset))}):
+    for path in sorted(paths):
         try:
-            read_image(path)
+            read(path)
         except CurviregError as error:
             problems.append(str(error))
     return problems
@@ -35,12 +42,19 @@ def unreadable(dataset: Dataset) -> list[str]:
 def report(dataset: Dataset, kind: DatasetSpec, images: bool, show: int) -> int:
     samples = [dataset.annotation(i) for i in range(len(dataset))]
     counts = Counter(kind.category.format_map(s) for s in samples)
-    print(f"{len(samples)} objects in {len({s['image_path'] for s in samples})} photographs")
+    photographs = {s["image_path"] for s in samples}
+    print(f"{len(samples)} objects in {len(photographs)} photographs")
     for name, count in sorted(counts.items()):
         print(f"  {name}: {count}")
-    skipped = dict(dataset.skipped_items)
-    if images:
-        skipped |= {"corrupt_image": found} if (found := unreadable(dataset)) else {}
+    meshes = {s[kind.scored.mesh] for s in samples}
+    scored = model_files(dataset.root / "models_eval").values()  # of a BOP set
+    found = {
+        **dataset.skipped_items,
+        "corrupt_image": unreadable(photographs if images else (), read_image),
+        "corrupt_mesh": unreadable(meshes, partial(load_mesh, unit=kind.scored.unit))
+        + unreadable(scored, read_points),
+    }
+    skipped = {reason: items for reason, items in found.items() if items}
     for reason, items in sorted(skipped.items()):
         defect = reason.startswith(DEFECTS)
         print(f"{'defect' if defect else 'left out'}, {reason}: {len(items)}")

@@ -8,12 +8,14 @@ the errors. Their rows replace those of the same sets in scripts/results/confide
 table is written from it.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 
 from sklearn.metrics import roc_auc_score
 
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.evaluation.compare import read_run
 from scripts._shared import (
@@ -56,14 +58,18 @@ def merged(stored: Sequence[Record], rows: Sequence[Record]) -> list[Record]:
 
 def measured(folder: Path) -> Record:
     """What the confidences of one run are worth; objects without a pose count as wrong, with
-    confidence 0."""
+    confidence 0, and those whose true pose is unknown do not count."""
     results = {row["key"]: row for row in read_lines(folder / "results.jsonl")}
     evaluated = read_run(folder)
-    errors = evaluated.errors
     scored = DATASETS[evaluated.dataset].scored.page_error
+    errors = {
+        key: row[scored] for key, row in evaluated.errors.items() if not math.isnan(row[scored])
+    }
+    if not errors:
+        raise InvalidInputError("no object whose true pose is known; leave it out", subject=folder)
     found = [results[key] for key in errors]
     confidences = [result.get("confidence") or 0.0 for result in found]
-    right = [row[scored] < RIGHT_DEG for row in errors.values()]
+    right = [error < RIGHT_DEG for error in errors.values()]
     trusted = [
         is_right for is_right, result in zip(right, found, strict=True) if result.get("reliable")
     ]

@@ -18,6 +18,7 @@ from operator import getitem
 from pathlib import Path
 from statistics import median
 
+from curvireg_torch.utils.checks import check_option
 from scripts._shared import (
     REPOSITORY,
     RESULTS,
@@ -72,8 +73,10 @@ def comparison(summaries: Sequence[Path], results: Path) -> str:
     for path in summaries:
         name = path.parent.name
         measured = read_json(path)
+        dataset = measured["settings"]["dataset"]
+        check_option(dataset, KINDS, f"{path}: dataset")
         earlier = stored(results / f"evaluation_{name}.json").get("summary", {})
-        for key in KINDS[measured["settings"]["dataset"]]["compared"]:
+        for key in KINDS[dataset]["compared"]:
             values = [score(summary.get(key), key) for summary in (earlier, measured)]
             rows.append([name, measured["n"], key, *values])
     return markdown_table(rows)

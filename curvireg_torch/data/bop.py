@@ -40,7 +40,7 @@ class BOPDataset(ObjectDataset):
         split: folder of the scenes, such as ``"test"`` or ``"train_pbr"``.
         targets: True selects the instances of ``test_targets_bop19.json``, for each image and
             object the ``inst_count`` most visible ones; False selects all; None is True for
-            ``split="test"`` if the file exists.
+            ``"test"`` and splits such as ``"test_primesense"`` if the file exists.
         models: folder of the meshes, such as ``"models_cad"``.
         transform, target_transform, transforms: see :class:`ObjectDataset`.
 
@@ -98,7 +98,8 @@ class BOPDataset(ObjectDataset):
         self.models_info = self._models.info
         target_file = self.root / "test_targets_bop19.json"
         if targets is None:
-            targets = split == "test" and target_file.is_file()
+            is_test = split == "test" or split.startswith("test_")  # test_primesense
+            targets = is_test and target_file.is_file()
         counts = _targets(target_file) if targets else None
         folders = sorted(p for p in scenes.iterdir() if p.is_dir())
         numbered = [folder for folder in folders if folder.name.isdecimal()]

@@ -216,12 +216,12 @@ class Pascal3DPlus(ObjectDataset):
 
 
 def _is_resized(image: Path, record: Any) -> bool:
-    """Whether a photograph has another size than its annotation states; a file that cannot be read
-    says so when its pixels are."""
+    """Whether a photograph, as it is stored, has another size than its annotation states, if it
+    states one; a file that cannot be read says so when its pixels are."""
     stated = record[0].get("imgsize")
     with suppress(CurviregError):
-        height, width = picture_size(image).shown
-        return isinstance(stated, list) and stated[:2] != [width, height]
+        height, width = picture_size(image).stored
+        return isinstance(stated, list) and stated[:2] not in ([], [width, height])
     return False
 
 

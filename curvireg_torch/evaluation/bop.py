@@ -1,5 +1,6 @@
 """BOP sets: poses, their errors and the file of results for the BOP challenge."""
 
+import os
 import re
 import warnings
 from collections import Counter, defaultdict
@@ -9,17 +10,18 @@ from itertools import chain
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ..data import BOPDataset
 from ..data.bop_models import model_files, read_models_info
-from ..errors import CurviregWarning
+from ..errors import CurviregError, CurviregWarning, MeshError
+from ..formats.meshes.files import read_mesh
 from ..geometry import symmetry_transforms
 from ..geometry.cameras import transform
 from ..jobs.entry import Entry
 from ..jobs.store import Row, Rows
-from ..mesh import load_mesh
 from ..utils.files import write_csv
 from . import metrics
 from .benchmark import Benchmark, Errors, estimated_rotations, true_rotations
@@ -65,6 +67,8 @@ class BOPBenchmark(Benchmark):
         infos = folder / "models_info.json"
         self._scored_files = model_files(folder)
         self._scored_infos = read_models_info(infos) if infos.is_file() else {}
+        self._scored_points: dict[int, Tensor] = {}
+        self._read_scored_models()
         if protocol.views > 1:
             for group in same_instances(self.samples):
                 views = [self._views(i, group) for i in group]
@@ -74,6 +78,19 @@ class BOPBenchmark(Benchmark):
             if few:
                 seen = f"{few} of {len(self.entries)} objects are seen in fewer photographs"
                 warnings.warn(f"views={protocol.views}: {seen}", CurviregWarning, stacklevel=2)
+
+    def _read_scored_models(self) -> None:
+        """Read the models of ``models_eval`` before anything is registered, and leave out the
+        objects whose model is damaged."""
+        for number in sorted({s["obj_id"] for s in self.samples} & self._scored_files.keys()):
+            try:
+                self._scored_points[number] = read_points(self._scored_files[number])
+            except CurviregError as error:
+                message = f"{error}; object {number} is left out"
+                warnings.warn(message, CurviregWarning, stacklevel=3)
+                for i, sample in enumerate(self.samples):
+                    if sample["obj_id"] == number:
+                        self.entries[i] = replace(self.entries[i], error="unreadable_mesh")
 
     def settings(self) -> Row:
         return {**super().settings(), "models": self.dataset.models}
@@ -117,7 +134,9 @@ class BOPBenchmark(Benchmark):
 
     def _errors_of_one_object(self, samples: Rows, rows: Rows) -> Tensor:
         path, info = self._scored_model(samples[0])
-        points = torch.from_numpy(load_mesh(path, unit=self.unit).vertices.copy())
+        points = self._scored_points.get(samples[0]["obj_id"])
+        if points is None:
+            points = read_points(path)
         symmetries = symmetry_transforms(info)
         t = torch.tensor([row["translation"] for row in rows], dtype=torch.float64)
         t_true, K = (
@@ -169,7 +188,7 @@ class BOPBenchmark(Benchmark):
     def results_name(self, settings: Row) -> str:
         """METHOD_DATASET-SPLIT.csv, which bop_toolkit takes apart at these signs."""
         method = f"curvireg-{settings.get('preset', 'custom')}"
-        dataset = re.sub("[_-]", "", self.dataset.root.resolve().name)
+        dataset = re.sub("[_-]", "", Path(os.path.abspath(self.dataset.root)).name)
         return f"{method}_{dataset}-{self.dataset.split.replace('_', '-')}.csv"
 
     def subsets(self, samples: Rows) -> dict[str, list[bool]]:
@@ -191,6 +210,16 @@ class BOPBenchmark(Benchmark):
                 )
                 lines.append((*image, s["obj_id"], row["score"], R, t, times[image]))
         write_csv(path, lines)
+
+
+def read_points(path: Path) -> Tensor:
+    """(V, 3) float64 vertices of a model, with those that no face uses, as bop_toolkit takes them;
+    :class:`MeshError` if it is damaged."""
+    vertices = np.asarray(read_mesh(path).vertices, dtype=np.float64)
+    points = vertices[np.isfinite(vertices).all(axis=1)]
+    if len(points) == 0:
+        raise MeshError("has no vertices; re-export the file", subject=path)
+    return torch.from_numpy(points)
 
 
 def same_instances(samples: Rows) -> list[list[int]]:

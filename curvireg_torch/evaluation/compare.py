@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from ..errors import InvalidInputError, MissingFileError
-from ..utils.files import read_csv, read_json
+from ..utils.files import read_csv, read_json, without_apostrophe
 from .registry import DATASETS
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ def read_run(folder: Path) -> Run:
     path = _existing(folder / "errors.csv")
     header, *rows = read_csv(path) or [[]]
     try:
-        errors = {row[0]: _numbers(header[2:], row[2:]) for row in rows}
+        errors = {without_apostrophe(row[0]): _numbers(header[2:], row[2:]) for row in rows}
     except (ValueError, IndexError) as error:
         raise InvalidInputError(f"damaged ({error}); {ADVICE}", subject=path) from error
     return Run(
@@ -214,7 +214,7 @@ def in_words(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
     """The comparison as text: each score, then a Markdown and a LaTeX row of each run."""
     only = [len(run.errors.keys() - other.errors.keys()) for run, other in ((a, b), (b, a))]
     common = len(a.errors.keys() & b.errors.keys())
-    lines = [f"A {a.name}: {_how(a)}", f"B {b.name}: {_how(b)}"]
+    lines = [f"A {a.name}: {_how(a, b)}", f"B {b.name}: {_how(b, a)}"]
     lines.append(
         f"{common} objects in both; {only[0]} only in A and {only[1]} only in B do not count"
     )
@@ -234,10 +234,25 @@ def in_words(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _how(run: Run) -> str:
-    meshes = run.settings.get("models", "models")
-    named = "" if meshes == "models" else f"meshes of {meshes}, "
-    return f"preset {run.settings.get('preset')}, {named}{run.settings.get('protocol')}"
+def _how(run: Run, other: Run) -> str:
+    """Preset and protocol of a run, and those of its settings that another run has not."""
+    theirs = _named(other.settings)
+    own = [
+        f"{name}={value}"
+        for name, value in _named(run.settings).items()
+        if name not in ("preset", "protocol") and (name, value) not in theirs.items()
+    ]
+    preset, protocol = (run.settings.get(name) for name in ("preset", "protocol"))
+    return ", ".join([f"preset {preset}", str(protocol), *own])
+
+
+def _named(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by name; those within others as in ``pipeline.box_jitter``."""
+    named: dict[str, Any] = {}
+    for name, value in settings.items():
+        inner = _named(value) if isinstance(value, dict) else {}
+        named |= {f"{name}.{key}": each for key, each in inner.items()} or {name: value}
+    return named
 
 
 def _digits(comparison: Comparison) -> str:

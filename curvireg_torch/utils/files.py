@@ -112,6 +112,16 @@ def _inert(cell: object) -> object:
     return cell if numbers else f"'{cell}"
 
 
+def without_apostrophe(cell: str) -> str:
+    """A cell as it was before :func:`write_csv` put an apostrophe in front.
+
+    Example:
+        >>> without_apostrophe("'-cup/0"), without_apostrophe("'tis")
+        ('-cup/0', "'tis")
+    """
+    return cell[1:] if _inert(cell[1:]) == cell else cell
+
+
 def check_writable(folder: Path) -> None:
     """Create a folder, or raise :class:`OutputError`, before work whose results go there."""
     probe = folder / f".probe-{secrets.token_hex(4)}"

@@ -47,11 +47,11 @@ def _struct_array(objects):
     return array
 
 
-def write_record(path, objects):
+def write_record(path, objects, imgsize=(80, 60, 3)):
     path.parent.mkdir(parents=True, exist_ok=True)
     record = {
         "filename": f"{path.stem}.jpg",
-        "imgsize": np.array([[80, 60, 3]]),
+        "imgsize": np.array([imgsize]),
         "objects": _struct_array(objects) if objects else EMPTY,
     }
     scipy.io.savemat(path, {"record": record}, do_compression=True)

@@ -129,9 +129,10 @@ def test_scenes_of_one_number_are_refused(root):
         BOPDataset(root)
 
 
-def test_other_splits_have_no_targets_by_default(root):
-    (root / "test").rename(root / "train_pbr")
-    assert len(BOPDataset(root, "train_pbr")) == 4
+@pytest.mark.parametrize(("split", "found"), [("test_primesense", ALL[2:]), ("train_pbr", ALL)])
+def test_splits_of_tests_alone_have_targets_by_default(root, split, found):
+    (root / "test").rename(root / split)
+    assert ids(BOPDataset(root, split)) == found
 
 
 def test_a_missing_split_names_those_that_are_there(tmp_path):

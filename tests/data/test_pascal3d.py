@@ -7,6 +7,7 @@ from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.errors import ImageError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from tests._support import refused
+from tests._support.exif import exif, with_exif
 from tests._support.miniature import pascal_object, write_image, write_pascal3d, write_record
 from tests._support.tables import check_values, text_table
 
@@ -139,6 +140,16 @@ def test_photographs_of_another_size_than_annotated_are_left_out(root):
     ]
     resized.write_bytes(b"no picture")  # its pixels say so
     assert "bad_image_size" not in cars(root).skipped
+
+
+def test_annotated_sizes_are_of_stored_pixels(root):
+    photograph = root / "Images" / "car_pascal" / "2008_000001.jpg"
+    with_exif(photograph, exif(6))
+    assert cars(root)[0]["image"].shape == (3, 60, 80)
+    record = root / "Annotations" / "car_pascal" / "2008_000001.mat"
+    for size, count in (((60, 80, 3), 1), ((), 0)):  # as shown, and not stated
+        write_record(record, [pascal_object("car")], size)
+        assert cars(root).skipped["bad_image_size"] == count
 
 
 def test_pascal3d_reports_missing_files_with_advice(root):

@@ -129,6 +129,11 @@ def test_objects_of_unknown_pose_do_not_count(tmp_path):
         assert (each.n, math.isnan(each.a)) == (0, True)
 
 
+def test_keys_are_those_of_the_results(tmp_path):
+    run = read_run(write_run(tmp_path, {"'-cup/0": 5, "'=cup/0": 5, "'tis/0": 5}))
+    assert list(run.errors) == ["-cup/0", "=cup/0", "'tis/0"]
+
+
 def test_the_command_prints_rows_for_tables(runs, capsys):
     assert main(["compare", *map(str, runs)]) == 0
     printed = capsys.readouterr().out
@@ -138,11 +143,14 @@ def test_the_command_prints_rows_for_tables(runs, capsys):
     assert "| a | 8 | 0.500 [0.215, 0.785] | 0.250 [" in printed
     assert "b\\_2 & 8 & 0.750 [0.409, 0.929] & 0.500 [" in printed
     assert printed.count(" \\\\\n") == 3
-    write_run(runs[1], B, models="models_cad")
+    write_run(runs[0], A, pipeline={"bins": 9, "box_jitter": 0.1})
+    write_run(runs[1], B, models="models_cad", pipeline={"bins": 9, "box_jitter": 0.0})
     assert main(["compare", *map(str, runs)]) == 0
     printed = capsys.readouterr().out
-    assert "a: preset learned, cad=annotated\n" in printed
-    assert "b_2: preset learned, meshes of models_cad, cad=annotated\n" in printed
+    first, second, *_ = printed.splitlines()
+    how = "preset learned, cad=annotated"
+    assert first.endswith(f"a: {how}, pipeline.box_jitter=0.1")
+    assert second.endswith(f"b_2: {how}, models=models_cad, pipeline.box_jitter=0.0")
     pair = [read_run(run) for run in runs]
     assert printed == in_words(*pair, compare(*pair))
     assert main(["compare", *map(str, runs), "--json"]) == 0

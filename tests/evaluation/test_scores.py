@@ -1,12 +1,14 @@
 """Scores of results that are written by hand, so that every number is known."""
 
 import math
+import runpy
 
 import pytest
 import torch
 import trimesh
 
 from curvireg_torch.data import Pascal3DPlus
+from curvireg_torch.errors import CurviregWarning
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, PoseFolderBenchmark, Protocol
 from curvireg_torch.evaluation.datasets import report
 from curvireg_torch.evaluation.detection import copy_shown, detection_recall
@@ -21,6 +23,7 @@ from tests._support.miniature import (
     write_mesh,
     write_record,
 )
+from tests._support.pages import ROOT
 from tests._support.tables import check_columns, check_values, text_table
 
 MATS_HERE = pytest.mark.usefixtures("mats_here")
@@ -338,9 +341,39 @@ def test_bop_errors_are_of_the_models_of_the_challenge(instances, tmp_path):
     assert errors["rotation"][first].tolist() == pytest.approx([180] * 3)
 
 
+def test_a_damaged_model_of_the_challenge_costs_its_objects_alone(bop, tmp_path, capsys):
+    write_mesh(bop.root / "models_eval" / "obj_000001.ply", half=25.0)
+    (bop.root / "models_eval" / "obj_000002.ply").write_bytes(b"ply\nformat ascii 1.0\n")
+    with pytest.warns(CurviregWarning, match=r"obj_000002\.ply: .*; object 2 is left out"):
+        benchmark = BOPBenchmark(bop, ANY)
+    rows = [posed(sample, 0) for sample in benchmark.samples]
+    summary = scores_of(benchmark, tmp_path / "out", rows)
+    check_values(summary, n=3, mssd_ar=1.0)
+    check_values(summary["skipped"], unreadable_mesh=1)
+    verify = runpy.run_path(str(ROOT / "datasets" / "verify.py"))
+    assert verify["main"](["bop", str(bop.root)]) == 1
+    assert "corrupt_mesh: 1\n" in capsys.readouterr().out
+
+
+def test_vertices_that_no_face_uses_are_scored(instances):
+    """One that is ten times as far from the axis of the rotation as the corners of the cube."""
+    benchmark, samples = instances
+    rows = [posed(sample, 20) for sample in samples]
+    plain = benchmark.errors(samples, rows)
+    path = benchmark.dataset.root / "models" / "obj_000002.ply"
+    cube = trimesh.load(path)
+    cube.vertices = [*cube.vertices, [250.0, 250.0, 0.0], [math.nan] * 3]
+    cube.export(path)
+    found = benchmark.errors(samples, rows)
+    assert found["mssd"][1] == pytest.approx(10 * plain["mssd"][1])
+    assert found["add"][1] == pytest.approx((8 + 10) / 9 * plain["add"][1])
+
+
 @pytest.mark.parametrize(("folder", "name"), [("lm", "lm"), ("my-own_set", "myownset")])
 def test_results_have_the_name_that_the_toolkit_takes_apart(bop, tmp_path, out, folder, name):
     benchmark = BOPBenchmark(bop, ANY)
+    bop.root.rename(tmp_path / "stored")
+    (tmp_path / folder).symlink_to("stored")
     bop.root = tmp_path / folder
     bop.split = "test_primesense"
     out.mkdir()

@@ -13,6 +13,7 @@ from scripts.confidence_table import (
     table_of_generated,
     table_of_withheld,
 )
+from tests._support import refused
 
 PAGE = REPOSITORY / "docs" / "accuracy.md"
 ROWS = """\
@@ -20,6 +21,7 @@ ROWS = """\
 {"key": "b", "confidence": 0.97, "reliable": true, "ambiguous": "several"}
 {"key": "c", "confidence": 0.31, "reliable": false, "ambiguous": "half turn"}
 {"key": "d", "verdict": "failed"}
+{"key": "e", "confidence": 0.99, "reliable": true, "ambiguous": null}
 """
 
 
@@ -28,7 +30,7 @@ def run(folder, column):
     summary = {"settings": {"dataset": "bop" if column == "rotation" else "pascal3d"}}
     (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
     (folder / "results.jsonl").write_text(ROWS, encoding="utf-8")
-    errors = f"key,group,{column}\na,1,29.9\nb,1,30.1\nc,2,3.0\nd,2,\n"
+    errors = f"key,group,{column}\na,1,29.9\nb,1,30.1\nc,2,3.0\nd,2,inf\ne,2,\n"
     (folder / "errors.csv").write_text(errors, encoding="utf-8")
     return folder
 
@@ -41,6 +43,9 @@ def test_confidences_are_counted(tmp_path, column):
     assert row["right"] == 0.5
     assert row["auc"] == 0.5  # of the pairs of right and wrong: ab -, ad +, cb -, cd +
     assert "| `set` | 4 | 0.56 | 0.50 | 2 | 1 | 2 | 0.50 |" in table([row])
+    (tmp_path / "set" / "errors.csv").write_text(f"key,group,{column}\na,1,\n", encoding="utf-8")
+    with refused("no object whose true pose is known"):
+        measured(tmp_path / "set")
 
 
 def test_new_rows_replace_those_of_the_same_set():

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from scripts import _shared, results_table
+from tests._support import refused
 
 
 def bop_summary(*, acc_15_deg=0.5, med_err_deg=3.25):
@@ -98,6 +99,9 @@ def test_comparison_shows_stored_and_new_scores(tmp_path, results):
     assert "| cups | 8 | acc_15_deg | 50.0 % | 62.5 % |" in text
     assert "| cups | 8 | med_err_deg | 3.2° | - |" in text
     assert "| mugs | 8 | acc_15_deg | - | 50.0 % |" in text, "it was never stored"
+    cups.write_text(json.dumps({"settings": {"dataset": "web"}}))
+    with refused(r"cups/summary\.json: dataset: expected one of 'pascal3d', 'bop', got 'web'"):
+        results_table.comparison([cups], results)
 
 
 def test_page_is_replaced_between_its_markers_alone(tmp_path):
