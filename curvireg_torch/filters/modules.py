@@ -117,7 +117,9 @@ class FunctionModule(nn.Module):
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         moved = self._buffers.get("camera_matrix")
         if camera is not None and moved is not None:
-            self._buffers["camera_matrix"] = camera.to(moved.device)
+            # of a meta tensor there are no values to move
+            kept = moved if camera.is_meta else camera
+            self._buffers["camera_matrix"] = kept.to(moved.device, camera.dtype)
         return self
 
     def extra_repr(self) -> str:
