@@ -191,6 +191,8 @@ class LayerContract:
             (x[0], "expected shape"),
             (x.byte(), r"expected a floating dtype, got torch\.uint8"),
             (x[..., :0], "at least"),
+            (x.to_sparse(), "expected a dense tensor"),
+            (x.to(torch.float8_e5m2), "that is not float8"),
         ]
         if case.accepts_colour:
             wrong.append((x.repeat(1, 4, 1, 1), "got"))
