@@ -169,7 +169,9 @@ def fill_missing(x: Tensor, mask: Tensor | None = None) -> Tensor:
     mask = replicate_box(mask, mask)
     # whole cells at all levels: sizes that are rounded would need a compiled graph each
     side = 2**MAX_HOLE_LEVELS
-    whole = (0, -x.shape[-1] % side, 0, -x.shape[-2] % side)
+    # torch cannot compile -n % side
+    right, below = ((n + side - 1) // side * side - n for n in (x.shape[-1], x.shape[-2]))
+    whole = (0, right, 0, below)
     sums = [F.pad(torch.where(mask, 0.0, x), whole)]
     weights = [F.pad((~mask).to(x.dtype), whole)]
     for _ in range(MAX_HOLE_LEVELS):

@@ -205,7 +205,7 @@ class LayerContract:
     def test_compile_fullgraph(self, case, dynamic):
         """Compiled by inductor for one size, and traced as one graph for any size."""
         torch._dynamo.reset()
-        options = {"dynamic": True, "backend": "eager"} if dynamic else {}
+        options = {"dynamic": True, "backend": "aot_eager"} if dynamic else {}
         graph = torch.compile(case.twin(), fullgraph=True, **options)
         for n, size in ((2, SIZE), (3, SIZE + 6)) if dynamic else ((2, SIZE),):
             x = case.inputs(n, size)
