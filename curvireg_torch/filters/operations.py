@@ -232,7 +232,7 @@ def zero_nonfinite_vectors(field: Tensor) -> Tensor:
 
 MAX_TENSOR_RADIUS = 16  # px, of the kernel of a sigma that is a tensor: a traced graph reserves it
 # px, below which a kernel is a single 1 in every dtype and has derivative 0
-MIN_TENSOR_SIGMA = 1e-3
+MIN_SIGMA = 1e-3
 
 
 def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
@@ -269,7 +269,7 @@ def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = 
         return x
     both: Any = (sigma, sigma)
     if isinstance(sigma, Tensor):
-        both = sigma.to(x.dtype).clamp(min=MIN_TENSOR_SIGMA).expand(1, 2)
+        both = sigma.to(x.dtype).clamp(min=MIN_SIGMA).expand(1, 2)
     # kornia makes its kernel on the default device
     with full_precision(x), _without_tf32(x), x.device:
         blurred: Tensor = gaussian_blur2d(x, 2 * radius + 1, both, "replicate")
@@ -307,7 +307,7 @@ def _weighted_shifts(x: Tensor, weights: Sequence[float] | Tensor) -> Tensor:
 def _kernel_radius(sigma: float | Tensor) -> int:
     """Of a kernel in px; that of a tensor that cannot be read is the largest."""
     if not isinstance(sigma, Tensor):
-        return math.ceil(4.0 * sigma)
+        return math.ceil(4.0 * sigma) if sigma >= MIN_SIGMA else 0
     if not is_host_readable(sigma):
         return MAX_TENSOR_RADIUS
     return min(max(math.ceil(4.0 * float(sigma.detach())), 1), MAX_TENSOR_RADIUS)
@@ -322,7 +322,7 @@ def _gaussian_kernel(sigma: float | Tensor, like: Tensor) -> Sequence[float] | T
         ]
         total = sum(kernel)
         return [weight / total for weight in kernel]
-    sigma = sigma.to(like.dtype).clamp(min=MIN_TENSOR_SIGMA)
+    sigma = sigma.to(like.dtype).clamp(min=MIN_SIGMA)
     offsets = torch.arange(-radius, radius + 1, device=like.device, dtype=like.dtype)
     weights = torch.exp(-0.5 * (offsets / sigma) ** 2) * (offsets.abs() <= torch.ceil(4.0 * sigma))
     return weights / weights.sum()

@@ -116,6 +116,17 @@ MODULES = {
 }
 
 
+def test_tiny_values_count_as_the_smallest():
+    x = photos(1, 16)
+    gradient = filters.image_gradient
+    assert torch.equal(gradient(x, sigma=1e-150), gradient(x, sigma=0.0))
+    saliency = filters.depth_curvilinear_saliency
+    assert torch.equal(saliency(depths(1), sigma=1e-160), saliency(depths(1), sigma=0.0))
+    smallest = filters.anisotropic_diffusion(x, iterations=2, kappa=1e-6)
+    assert smallest.isfinite().all()
+    assert torch.equal(filters.anisotropic_diffusion(x, iterations=2, kappa=1e-39), smallest)
+
+
 @pytest.mark.parametrize("name", list(MODULES))
 def test_layers_are_built_on_any_default_device_and_compute_on_that_of_the_image(name):
     module, options, inputs, _ = MODULES[name]
