@@ -13,7 +13,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ..errors import InvalidInputError, MissingFileError
 from ..filters import operations as ops
-from ..utils.checks import check_colour_image
+from ..utils.checks import check_colour_image, check_tensor
 from ..utils.files import write_tensors
 from .backbone import OneDNNConv2d, assign_weights
 
@@ -35,6 +35,7 @@ def doubled_angle(field: Tensor) -> Tensor:
         >>> doubled_angle(field).flatten().tolist() == doubled_angle(-field).flatten().tolist()
         True
     """
+    check_tensor(field, "field", (None, 2, None, None))
     x, y = ops.at_least_float32(field).unbind(1)
     length = ops.safe_sqrt(x * x + y * y)
     scale = length.clamp(min=1e-12) ** -1.5
@@ -42,7 +43,8 @@ def doubled_angle(field: Tensor) -> Tensor:
 
 
 def halved_angle(doubled: Tensor) -> Tensor:
-    """Inverse of :func:`doubled_angle`; each vector is in the half plane x >= 0.
+    """Inverse of :func:`doubled_angle` for lengths from 1e-12 to 1e18; each vector is in the half
+    plane x >= 0.
 
     Example:
         >>> import torch
@@ -50,15 +52,21 @@ def halved_angle(doubled: Tensor) -> Tensor:
         >>> halved_angle(doubled_angle(field)).flatten().abs().tolist()
         [3.0, 0.0]
     """
+    check_tensor(doubled, "doubled", (None, 2, None, None))
     c, s = ops.at_least_float32(doubled).unbind(1)
     length = ops.safe_sqrt(c * c + s * s)
     # With m = length^2 and cos 2t = c / length, compute the larger of m |cos t| and m |sin t|
     # without cancellation and the other from sin 2t = 2 sin t cos t.
-    larger = ops.safe_sqrt(0.5 * length * (length + c.abs()))
-    smaller = 0.5 * length * s.abs() / larger.clamp(min=ops.safe_eps(larger))
+    larger = ops.safe_sqrt(0.5 * length * (length + _absolute(c)))
+    smaller = 0.5 * length * _absolute(s) / larger.clamp(min=ops.safe_eps(larger))
     x = torch.where(c >= 0, larger, smaller)
     y = torch.where(c >= 0, smaller, larger)
     return (length[:, None] * torch.stack([x, torch.where(s < 0, -y, y)], dim=1)).to(doubled.dtype)
+
+
+def _absolute(x: Tensor) -> Tensor:
+    """abs(x) with derivative 1 at 0, where that of torch is 0."""
+    return torch.where(x < 0, -x, x)
 
 
 def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
@@ -113,6 +121,11 @@ class FieldNetwork(nn.Module):
         self.head = OneDNNConv2d(a, 3, 3, 1, 1)
 
     def forward(self, image: Tensor) -> Tensor:
+        check_tensor(image, "image", (None, 3, None, None))
+        if any(side % 16 or side == 0 for side in image.shape[2:]):
+            raise InvalidInputError(
+                f"image: expected sides that are multiples of 16 px, got {tuple(image.shape)}"
+            )
         x = 4.0 * (image - 0.5)
         levels = []
         for block in self.down:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_tensor
+from ..utils.checks import check_finite, check_tensor
 
 
 class Whitening(nn.Module):
@@ -22,7 +22,13 @@ class Whitening(nn.Module):
         super().__init__()
         check_tensor(mean, "mean", (None,))
         check_tensor(covariance, "covariance", (len(mean), len(mean)))
-        factor, failed = torch.linalg.cholesky_ex(covariance.double())
+        check_finite(mean, "mean")
+        check_finite(covariance, "covariance")
+        covariance = covariance.double()
+        # of which only one half is read
+        if (covariance - covariance.T).norm() > 1e-4 * covariance.norm():
+            raise InvalidInputError("covariance: expected a symmetric matrix")
+        factor, failed = torch.linalg.cholesky_ex(covariance)
         if int(failed):
             raise InvalidInputError("covariance: expected a positive definite matrix; shrink it")
         identity = torch.eye(len(mean), dtype=torch.float64, device=mean.device)
@@ -35,6 +41,7 @@ class Whitening(nn.Module):
 
     def forward(self, descriptors: Tensor) -> Tensor:
         """(N, D) -> (N, D)."""
+        check_tensor(descriptors, "descriptors", (None, len(self.mean)))
         return (descriptors.to(self.mean) - self.mean) @ self.matrix.T
 
 

@@ -116,7 +116,7 @@ def depth_curvilinear_saliency(
             rounding); a number multiplies the depth (1 with depth in px gives curvature in 1/px).
 
     Returns:
-        (B, 2, H, W) vector field, finite everywhere; its length is CS >= 0.
+        (B, 2, H, W) vector field, finite at missing pixels too; its length is CS >= 0.
 
     Example:
         >>> y, x = torch.meshgrid(torch.arange(65.0) - 32, torch.arange(65.0) - 32, indexing="ij")

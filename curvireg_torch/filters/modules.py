@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import InvalidInputError
-from ..utils.aliases import Document, Fields
+from ..utils.aliases import Fields
 from ..utils.checks import check_positive
 
 
@@ -117,35 +117,10 @@ class FunctionModule(nn.Module):
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         moved = self._buffers.get("camera_matrix")
         if camera is not None and moved is not None:
-            self._buffers["camera_matrix"] = camera.to(moved.device)
+            # of a meta tensor there are no values to move
+            kept = moved if camera.is_meta else camera
+            self._buffers["camera_matrix"] = kept.to(moved.device, camera.dtype)
         return self
-
-    def _load_from_state_dict(
-        self,
-        state_dict: Document,
-        prefix: str,
-        local_metadata: Any,
-        strict: bool,
-        missing_keys: list[str],
-        unexpected_keys: list[str],
-        error_msgs: list[str],
-    ) -> None:
-        """Say what to do about the state of a learnable module in a fixed one, and the reverse."""
-        lists = missing_keys, unexpected_keys
-        super()._load_from_state_dict(
-            state_dict, prefix, local_metadata, strict, *lists, error_msgs
-        )
-        kind = type(self).__name__
-        for name in self._learnable:
-            key = f"{prefix}log_{name}"
-            hints = (
-                f"is a parameter of {kind}(learnable=True), and {name} is fixed here; build the "
-                f"module with learnable=True",
-                f"is no part of the state of {kind}(learnable=False); pass {name} to the "
-                f"constructor, and load with strict=False to keep it",
-            )
-            for keys, hint in zip((unexpected_keys, missing_keys), hints, strict=True):
-                keys[:] = [f"{key} {hint}" if one == key else one for one in keys]
 
     def extra_repr(self) -> str:
         options = self.options

@@ -41,6 +41,7 @@ def anisotropic_diffusion(
         iterations: number of steps, >= 0.
         kappa: difference in grey levels above which an edge is preserved, > 0; a scalar tensor is
             differentiable. It has the unit of the image: 0.03 is for [0, 1], about 8 for [0, 255].
+            Values below 1e-6 count as 1e-6.
         step: time step in (0, 0.25]; larger steps are unstable.
         conductance: ``"rational"`` or ``"exponential"``.
 
@@ -112,9 +113,9 @@ def _flow(
     difference: Tensor, kappa: float | Tensor, conductance: str, inside: Tensor | None
 ) -> Tensor:
     difference = difference if inside is None else difference * inside
-    # The range of a tensor cannot be checked while tracing.
+    # The range of a tensor cannot be checked while tracing, and its square must not overflow.
     scaled = difference * (
-        1.0 / (kappa.clamp(min=1e-6, max=1e6) if isinstance(kappa, Tensor) else kappa)
+        1.0 / (kappa.clamp(1e-6, 1e6) if isinstance(kappa, Tensor) else max(kappa, 1e-6))
     )
     if conductance == "rational":
         return difference / torch.addcmul(scaled.new_ones(()), scaled, scaled)

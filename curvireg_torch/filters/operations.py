@@ -59,10 +59,16 @@ def image_maximum(x: Tensor, mask: Tensor | None = None) -> Tensor:
     return x.amax(dim=(1, 2, 3), keepdim=True)
 
 
+def is_traced() -> bool:
+    """Whether calls become a graph, by torch.compile or within a mode, as that of fake tensors."""
+    # torch has no public test for modes
+    return torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0
+
+
 def is_host_readable(x: Tensor) -> bool:
-    """Whether Python can read the values of x at no cost: a CPU tensor, not compiled, not in a
+    """Whether Python can read the values of x at no cost: a CPU tensor, not traced, not in a
     ``torch.func`` call."""
-    if torch.compiler.is_compiling() or x.device.type != "cpu":
+    if is_traced() or x.device.type != "cpu":
         return False
     # torch has no public test for this
     return not torch._C._functorch.is_functorch_wrapped_tensor(x)
@@ -169,7 +175,9 @@ def fill_missing(x: Tensor, mask: Tensor | None = None) -> Tensor:
     mask = replicate_box(mask, mask)
     # whole cells at all levels: sizes that are rounded would need a compiled graph each
     side = 2**MAX_HOLE_LEVELS
-    whole = (0, -x.shape[-1] % side, 0, -x.shape[-2] % side)
+    # torch cannot compile -n % side
+    right, below = ((n + side - 1) // side * side - n for n in (x.shape[-1], x.shape[-2]))
+    whole = (0, right, 0, below)
     sums = [F.pad(torch.where(mask, 0.0, x), whole)]
     weights = [F.pad((~mask).to(x.dtype), whole)]
     for _ in range(MAX_HOLE_LEVELS):
@@ -230,7 +238,7 @@ def zero_nonfinite_vectors(field: Tensor) -> Tensor:
 
 MAX_TENSOR_RADIUS = 16  # px, of the kernel of a sigma that is a tensor: a traced graph reserves it
 # px, below which a kernel is a single 1 in every dtype and has derivative 0
-MIN_TENSOR_SIGMA = 1e-3
+MIN_SIGMA = 1e-3
 
 
 def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
@@ -267,7 +275,7 @@ def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = 
         return x
     both: Any = (sigma, sigma)
     if isinstance(sigma, Tensor):
-        both = sigma.to(x.dtype).clamp(min=MIN_TENSOR_SIGMA).expand(1, 2)
+        both = sigma.to(x.dtype).clamp(min=MIN_SIGMA).expand(1, 2)
     # kornia makes its kernel on the default device
     with full_precision(x), _without_tf32(x), x.device:
         blurred: Tensor = gaussian_blur2d(x, 2 * radius + 1, both, "replicate")
@@ -278,7 +286,7 @@ def prefers_shifts(*inputs: Tensor | float) -> bool:
     """Whether sums of shifted images take the place of kornia's Gaussian: in graphs, where they
     fuse with what surrounds them, and on a CPU where gradients are wanted, since those of
     convolutions of a single channel are slow (docs/kornia.md has the times)."""
-    if torch.compiler.is_compiling():
+    if is_traced():
         return True
     wanted = [x for x in inputs if isinstance(x, Tensor) and x.requires_grad]
     return torch.is_grad_enabled() and any(x.device.type == "cpu" for x in wanted)
@@ -305,7 +313,7 @@ def _weighted_shifts(x: Tensor, weights: Sequence[float] | Tensor) -> Tensor:
 def _kernel_radius(sigma: float | Tensor) -> int:
     """Of a kernel in px; that of a tensor that cannot be read is the largest."""
     if not isinstance(sigma, Tensor):
-        return math.ceil(4.0 * sigma)
+        return math.ceil(4.0 * sigma) if sigma >= MIN_SIGMA else 0
     if not is_host_readable(sigma):
         return MAX_TENSOR_RADIUS
     return min(max(math.ceil(4.0 * float(sigma.detach())), 1), MAX_TENSOR_RADIUS)
@@ -320,7 +328,7 @@ def _gaussian_kernel(sigma: float | Tensor, like: Tensor) -> Sequence[float] | T
         ]
         total = sum(kernel)
         return [weight / total for weight in kernel]
-    sigma = sigma.to(like.dtype).clamp(min=MIN_TENSOR_SIGMA)
+    sigma = sigma.to(like.dtype).clamp(min=MIN_SIGMA)
     offsets = torch.arange(-radius, radius + 1, device=like.device, dtype=like.dtype)
     weights = torch.exp(-0.5 * (offsets / sigma) ** 2) * (offsets.abs() <= torch.ceil(4.0 * sigma))
     return weights / weights.sum()

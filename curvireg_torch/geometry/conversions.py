@@ -22,6 +22,7 @@ from ..utils.checks import (
     check_pose,
     check_rotation,
 )
+from ..utils.precision import full_precision
 
 
 def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
@@ -69,6 +70,7 @@ def axis_angle_from_rotation(R: Tensor) -> Tensor:
     return axis_angle
 
 
+@full_precision()
 def rotation_from_axis_angle(axis_angle: Tensor) -> Tensor:
     """(..., 3) axis x angle in radians to (..., 3, 3) rotations, by Rodrigues' formula.
 

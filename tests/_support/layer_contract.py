@@ -191,6 +191,8 @@ class LayerContract:
             (x[0], "expected shape"),
             (x.byte(), r"expected a floating dtype, got torch\.uint8"),
             (x[..., :0], "at least"),
+            (x.to_sparse(), "expected a dense tensor"),
+            (x.to(torch.float8_e5m2), "that is not float8"),
         ]
         if case.accepts_colour:
             wrong.append((x.repeat(1, 4, 1, 1), "got"))
@@ -203,7 +205,7 @@ class LayerContract:
     def test_compile_fullgraph(self, case, dynamic):
         """Compiled by inductor for one size, and traced as one graph for any size."""
         torch._dynamo.reset()
-        options = {"dynamic": True, "backend": "eager"} if dynamic else {}
+        options = {"dynamic": True, "backend": "aot_eager"} if dynamic else {}
         graph = torch.compile(case.twin(), fullgraph=True, **options)
         for n, size in ((2, SIZE), (3, SIZE + 6)) if dynamic else ((2, SIZE),):
             x = case.inputs(n, size)

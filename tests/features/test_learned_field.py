@@ -15,7 +15,7 @@ from curvireg_torch.errors import MissingFileError
 from curvireg_torch.features import LearnedCurvilinearSaliency, doubled_angle, halved_angle
 from curvireg_torch.features.backbone import Backbone, describe
 from curvireg_torch.features.learned_field import FieldNetwork, save_weights
-from tests._support import refused, seeded, uniform
+from tests._support import double, refused, seeded, uniform
 
 from .._support.layer_contract import LayerCase, LayerContract
 from .._support.quick import slow_after
@@ -60,6 +60,25 @@ def test_halved_angle_inverts_doubled_angle_in_every_dtype(dtype, size):
     # 1e-6 in float16 has only 4 bits.
     precision = 0.5 if (dtype, size) == (torch.float16, 1e-6) else 16 * torch.finfo(dtype).eps
     assert off.max() < precision * size
+
+
+@pytest.mark.parametrize("vector", [(1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (0.6, -0.8)])
+def test_halved_angle_has_gradients_along_the_axes(vector):
+    x = double(vector).view(1, 2, 1, 1).requires_grad_()
+    assert torch.autograd.gradcheck(halved_angle, x)
+    assert torch.autograd.gradgradcheck(halved_angle, x)
+
+
+def test_what_training_uses_refuses_wrong_input():
+    network = FieldNetwork((4, 4, 8, 8))
+    for function, x, message in (
+        (doubled_angle, torch.ones(1, 3, 4, 4), r"field: expected shape \(\*, 2"),
+        (halved_angle, torch.ones(1, 2, 4, 4, dtype=torch.long), "doubled: expected a floating"),
+        (network, torch.ones(1, 1, 32, 32), r"image: expected shape \(\*, 3"),
+        (network, torch.ones(1, 3, 32, 40), "multiples of 16 px"),
+    ):
+        with refused(message):
+            function(x)
 
 
 def test_learned_field_loads_other_weights_and_rejects_bad_ones(tmp_path):

@@ -42,3 +42,11 @@ def test_whitening_refuses_covariances_that_cannot_be_inverted():
         Whitening(x.mean(dim=0), x.T.cov())
     with refused("covariance"):
         Whitening(torch.zeros(3), torch.eye(2))
+    with refused("mean: expected finite"):
+        Whitening(torch.full((2,), torch.nan), torch.eye(2))
+    with refused("covariance: expected finite"):
+        Whitening(torch.zeros(2), torch.full((2, 2), torch.nan))
+    with refused("symmetric"):
+        Whitening(torch.zeros(2), torch.tensor([[1.0, 0.5], [0.0, 1.0]]))
+    with refused(r"descriptors: expected shape \(\*, 2\)"):
+        Whitening(torch.zeros(2), torch.eye(2))(torch.ones(3, 5))

@@ -46,6 +46,9 @@ def test_axis_angle_agrees_with_scipy(angle):
     back = g.axis_angle_from_rotation(torch.from_numpy(R))
     assert_allclose(g.rotation_from_axis_angle(back), R, atol=1e-14)
     assert back.norm(dim=1).max() <= math.pi + 1e-12
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        single = g.rotation_from_axis_angle(torch.from_numpy(vectors).float())
+    assert_allclose(single, R, atol=2e-6)
 
 
 AXIS = [1.0, 2.0, -2.0]
