@@ -59,16 +59,10 @@ def image_maximum(x: Tensor, mask: Tensor | None = None) -> Tensor:
     return x.amax(dim=(1, 2, 3), keepdim=True)
 
 
-def is_traced() -> bool:
-    """Whether calls become a graph, by torch.compile or within a mode, as that of fake tensors."""
-    # torch has no public test for modes
-    return torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0
-
-
 def is_host_readable(x: Tensor) -> bool:
-    """Whether Python can read the values of x at no cost: a CPU tensor, not traced, not in a
+    """Whether Python can read the values of x at no cost: a CPU tensor, not compiled, not in a
     ``torch.func`` call."""
-    if is_traced() or x.device.type != "cpu":
+    if torch.compiler.is_compiling() or x.device.type != "cpu":
         return False
     # torch has no public test for this
     return not torch._C._functorch.is_functorch_wrapped_tensor(x)
@@ -286,7 +280,7 @@ def prefers_shifts(*inputs: Tensor | float) -> bool:
     """Whether sums of shifted images take the place of kornia's Gaussian: in graphs, where they
     fuse with what surrounds them, and on a CPU where gradients are wanted, since those of
     convolutions of a single channel are slow (docs/kornia.md has the times)."""
-    if is_traced():
+    if torch.compiler.is_compiling():
         return True
     wanted = [x for x in inputs if isinstance(x, Tensor) and x.requires_grad]
     return torch.is_grad_enabled() and any(x.device.type == "cpu" for x in wanted)

@@ -8,8 +8,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch._dynamo.testing import CompileCounter
-from torch._subclasses.fake_tensor import FakeTensorMode
-from torch.fx.experimental.proxy_tensor import make_fx
 
 from curvireg_torch import camera_matrix, filters
 
@@ -33,12 +31,9 @@ class TestLayers(LayerContract):
             found = tensors(case(x))
         torch.testing.assert_close(found, tensors(case(x)), rtol=0.0, atol=0.0)
 
-    def test_meta_and_fake_tensors_give_shapes(self, case):
+    def test_meta_gives_shapes(self, case):
         x = case.inputs(2, SIZE)
-        twin = case.twin()
-        with FakeTensorMode(allow_non_fake_inputs=True):
-            assert twin(torch.empty(x.shape)).shape == case(x).shape
-        assert twin.to("meta")(x.to("meta")).shape == case(x).shape
+        assert case.twin().to("meta")(x.to("meta")).shape == case(x).shape
 
 
 @pytest.mark.parametrize(
@@ -58,15 +53,6 @@ def test_depth_layers_are_finite_with_missing_depth(layer, hole):
     assert y[1].detach().abs().max() == 0.0
     far = layer(depths(2))[0, ..., :4]
     assert equal_up_to_sign(y[:1, ..., :4].detach(), far[None], atol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["cs", "ig", "hog"])
-def test_make_fx_gives_a_graph_for_other_images(name):
-    case = LAYERS[name]
-    x = case.inputs(2, SIZE)
-    graph = make_fx(case.twin())(x)
-    holes = torch.where(x > 0.9 * x.amax(), torch.nan, x)
-    assert LayerContract().agrees(graph(holes), case(holes))
 
 
 @pytest.mark.slow
