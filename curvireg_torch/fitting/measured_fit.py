@@ -11,7 +11,7 @@ from ..rendering.contours import MeshContours
 from ..utils.rows import Rows
 from .contour_problem import ContourProblem, ContourState
 from .edges import EdgeCrops
-from .least_squares import PointMatches, pixels, pose_covariance
+from .least_squares import Measurements, PointMatches, pixels, pose_covariance, project
 
 FULL_SIZE_RADII = (4.0, 2.0, 2.0)
 """Search radius for edges in px at full size, one a round."""
@@ -111,6 +111,20 @@ def edges_at(
     problem = ContourProblem.of(contours, crops, K, image_index)
     state = problem.state(T)
     return problem.edge_support(state), edge_excess(problem, state)
+
+
+@torch.no_grad()
+def ideal_covariance(
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+) -> Tensor:
+    """(N, 6, 6) covariance that :class:`ContourFit` would have of poses ``T`` (N, 4, 4) if an edge
+    lay at each contour point: what it leaves open, no photograph determines to first order."""
+    problem = ContourProblem.of(contours, crops, K, image_index)
+    points = problem.state(T).points
+    _, J = project(points.model, points.normals, T, problem.K, contours.centre)
+    weight = points.valid[..., None].to(J)
+    edges = Measurements(J, torch.zeros_like(weight), weight)
+    return pose_covariance(edges, points, T, problem.K, contours.centre, radius=contours.radius)[0]
 
 
 def edge_excess(problem: ContourProblem, state: ContourState) -> Tensor:

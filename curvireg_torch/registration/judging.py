@@ -4,6 +4,7 @@ Doubts about the best pose are settled by what a symmetry of the shape makes of 
 of other meshes.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -14,6 +15,8 @@ from ..errors import CurviregError
 from ..evidence import Evidence, EvidenceWeights
 from ..fitting.details import ContourDetails, compared, contour_details
 from ..fitting.edges import EdgeCrops
+from ..fitting.least_squares import apply_twist
+from ..fitting.measured_fit import ideal_covariance
 from ..geometry.framing import border_sides, outside_fraction
 from ..geometry.viewpoint import rotation_error
 from ..mesh.round_axis import RoundAxis
@@ -35,6 +38,7 @@ from .hypotheses import Hypotheses, by_contours, hypothesis_of, placed
 from .photograph import Photograph
 from .result import (
     AXIS_TOLERANCE,
+    UNKNOWN_ROTATION,
     Axis,
     FailedRegistration,
     Registration,
@@ -108,6 +112,66 @@ def pair_probability(rivals: Rivals, symmetries: Tensor | None) -> float:
     members[:2] = True
     near = [are_near(rivals.view_rotations, R, symmetries) for R in rivals.rotations[:2]]
     return rivals.probability(members, near[0] | near[1])
+
+
+# Score that a pose must lose where it is turned by RIVAL_ANGLE to either side, for its turn to be
+# determined: with scores as log probabilities that fall with the square of the angle, nine in ten
+# turns then lie within
+LEAST_LOSS = 1.353
+
+
+def with_determined_turns(
+    target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses
+) -> Hypotheses:
+    """Poses whose covariance contains what finite turns determine, that of the best one in each
+    photograph.
+
+    The contours of a flat bottle that is seen from its broad side hardly move where it turns a
+    little about its axis: to first order nothing determines that turn. By 30 degrees they change
+    plainly, and what the score loses there gives the deviation of the turn. It counts only where
+    the contours of the mesh leave the same turn open even if the photograph shows all of them. If
+    not, the photograph lacks edges that the mesh predicts: perhaps it shows another object.
+    """
+    for row in poses.best(target.score_weights(exact=True)).split(1):
+        covariance = _with_finite_turn(target, block, crops, poses[row])
+        if covariance is not None:
+            covariances = poses.covariance.index_copy(0, row, covariance[None])
+            poses = replace(poses, covariance=covariances)
+    return poses
+
+
+def _with_finite_turn(
+    target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
+) -> Tensor | None:
+    """Covariance (6, 6) of a pose of which one turn is open to first order and a finite one is not;
+    None for others."""
+    covariance = best.covariance[0]
+    if not bool(covariance.isfinite().all()):
+        return None
+    variances, axes = torch.linalg.eigh(covariance[:3, :3])
+    is_open = variances >= UNKNOWN_ROTATION**2
+    axis = axes[:, 2]
+    if is_open.tolist() != [False, False, True]:
+        return None
+    ideal = by_contours(ideal_covariance, target.describer, crops, best)[0, :3, :3]
+    if not float(axis @ ideal @ axis) >= UNKNOWN_ROTATION**2:
+        return None
+    twist = torch.zeros(3, 6, dtype=torch.float64)
+    twist[1:, :3] = math.radians(RIVAL_ANGLE) * torch.stack([axis, -axis])
+    copies = best[torch.zeros(3, dtype=torch.long)]
+    centre = target.describer.centre
+    turned = with_evidence(
+        target, block, placed(copies, apply_twist(copies.T, twist, centre), centre)
+    )
+    scores = turned.evidence.scores(target.score_weights(exact=True))
+    loss = float(scores[0] - scores[1:].max())
+    if loss < LEAST_LOSS:
+        return None
+    # as if the turn had been measured, so that the covariance with other motions stays consistent
+    variance = math.radians(RIVAL_ANGLE) ** 2 / (2.0 * loss)
+    along = covariance[:, :3] @ axis
+    removed: Tensor = (1.0 - variance / variances[2]) / variances[2] * torch.outer(along, along)
+    return covariance - removed
 
 
 # Fraction of the object outside the photograph from which a result carries a warning

@@ -50,7 +50,7 @@ from .hypotheses import (
     with_edge_support,
     with_short_fit,
 )
-from .judging import best_of_meshes, judged, with_siblings
+from .judging import best_of_meshes, judged, with_determined_turns, with_siblings
 from .mirror_image import MIRROR_WARNING, compared_with_mirror_image
 from .photograph import Photograph, check_crop
 from .result import FailedRegistration, Registration, Results
@@ -339,6 +339,8 @@ def register(
     if block.crops is not None:
         block, poses = with_focal_deviation(target, block, block.crops, poses)
     compared = Hypotheses.cat([poses, rivals])
+    if block.crops is not None and block.exact:
+        compared = with_determined_turns(target, block, block.crops, compared)
     results = judge(target, block, compared, feature_is_hidden)
     if block.crops is None or not block.exact:
         return results
