@@ -287,9 +287,8 @@ class Session:
         """
         try:
             check_camera(camera)
-        except InvalidInputError as error:  # of the option of this name
-            words = str(error).replace("--fov", "field of view")
-            raise InvalidInputError(words.removeprefix("--")) from error
+        except InvalidInputError as error:
+            raise InvalidInputError(str(error).replace("fov", "field of view")) from error
         calibrated = isinstance(camera, Camera) or isinstance(self.options.camera, Camera)
         shots = [
             self._open_again(shot, None, camera) if calibrated and not shot.view else shot
