@@ -319,11 +319,6 @@ class Session:
         if self.rig_path is not None and self.rig_path.is_dir():
             self.open_rig(self.rig_path)
 
-    @property
-    def has_exif(self) -> bool:
-        """Whether the photograph's file tells the focal length."""
-        return self.shot.photo is not None and self.shot.photo.guessed_camera_matrix() is not None
-
     def set_limits(self, **limits: Any) -> None:
         """Change what is known of the pose: arguments of :class:`PosePrior`; None removes a
         limit."""

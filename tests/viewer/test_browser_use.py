@@ -328,9 +328,8 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
         browser.upload("photograph", folder / name)
         browser.begins("photograph-facts", f"{name}: ")
     assert browser.messages() == []
-    browser.unfold("camera")
-    browser.click("exif")
     browser.shows("camera-facts", "from the photograph's EXIF, 37 mm of a 35 mm camera")
+    browser.unfold("camera")
     browser.unfold("command-line")
     browser.part("fov").send_keys("65\n")
     browser.contains("command", "--fov 65")
