@@ -11,6 +11,7 @@ import pytest
 import curvireg_torch as cr
 from curvireg_torch import Camera, Registration, camera_matrix
 from curvireg_torch.cli import main
+from curvireg_torch.cli import register as of_register
 from curvireg_torch.cli.register import NONE_RELIABLE, SOME_FAILED
 from curvireg_torch.data import images
 from curvireg_torch.errors import InvalidInputError
@@ -164,7 +165,7 @@ def test_lists_take_calibration_files_and_masks(folder, lens, tmp_path):
 def test_strict_tells_by_the_exit_code_whether_what_is_needed_is_reliable(
     folder, register_one, register, tmp_path, monkeypatch
 ):
-    words = ["--camera", *CAMERA, "--no-refine"]
+    """tests/cli/test_views.py has the verdict of a registration."""
     for verdict, need, code in (
         ("reliable", [], 0),
         ("reliable axis", [], NONE_RELIABLE),
@@ -173,10 +174,10 @@ def test_strict_tells_by_the_exit_code_whether_what_is_needed_is_reliable(
         ("reliable", ["--need", "axis"], 0),
         ("unsure", ["--need", "axis"], NONE_RELIABLE),
     ):
-        monkeypatch.setattr(Registration, "verdict", verdict)
-        assert register_one(*words, "--strict", *need) == code
+        monkeypatch.setattr(of_register, "_register_alone", lambda _, verdict=verdict: verdict)
+        assert register_one("--strict", *need) == code
     with pytest.raises(SystemExit):  # without --strict
-        register_one(*words, "--need", "axis")
+        register_one("--need", "axis")
     listed = tmp_path / "list.csv"
     words = ["--list", listed, folder / "truck.safetensors", "--strict", "--need", "axis"]
     for verdict, names, code in (
