@@ -13,7 +13,9 @@ from curvireg_torch import Registrar, camera_matrix
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.printing import _advice, _print_rivals, print_result
 from curvireg_torch.cli.registering import _write_pose
+from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
+from curvireg_torch.jobs import photograph
 from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from tests._support import bank_of, double, scene, slow_after, truck_bank
@@ -31,11 +33,6 @@ def test_register_writes_result_and_overlay(registered, tmp_path, capsys):
     assert cv2.imread(str(tmp_path / "out" / "overlay.png")).std() > 20
     assert (np.shape(result["covariance"]), len(result["probabilities"])) == ((6, 6), 2)
     assert sum(result["probabilities"]) + result["no_match_probability"] == pytest.approx(1.0)
-    deviations = result["standard_deviations"]
-    assert deviations["translation"] == pytest.approx(
-        [result["covariance"][i][i] ** 0.5 for i in (3, 4, 5)]
-    )
-    assert all(0 < v < 30 for v in deviations["rotation_deg"])
     printed = capsys.readouterr().out
     assert "viewpoint" in printed
     assert "standard deviations: " in printed
@@ -46,12 +43,14 @@ def test_register_is_told_that_a_box_is_that_of_the_visible_part(registered):
         assert registered("--no-refine", *words)["pipeline"]["box_is"] == box_is
 
 
-def test_register_without_box_and_camera(folder, registered, capsys):
+def test_register_without_box_and_camera(folder, registered, capsys, monkeypatch):
     files = [str(folder / name) for name in ("photos/0.png", "truck.safetensors")]
     words = ["register", *files, "--no-refine", "--json"]
     assert main([*words, "--box", *box_of(0)]) == 0
     assert "detecting" not in capsys.readouterr().err
-    assert main(words) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(photograph, "_results_of", Mock(side_effect=LostObjectError("nowhere")))
+        assert main(words) == 2
     assert "0.png: detecting the object" in capsys.readouterr().err
     found = registered("--no-refine", "--mesh-is", "similar")
     assert capsys.readouterr().err == ""
@@ -123,7 +122,7 @@ def test_register_takes_views_from_the_bank_unless_a_pipeline_file_is_given(
     assert "pose upright, " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("preset", slow_after(2, sorted(PRESETS, reverse=True)))
+@pytest.mark.parametrize("preset", slow_after(1, sorted(PRESETS, reverse=True)))
 def test_register_equals_registrar_bit_by_bit(folder, registered, monkeypatch, preset):
     monkeypatch.setenv("CURVIREG_CACHE", str(folder / "equal"))
     # The views of every preset, thinned out: 12 instead of 7200.

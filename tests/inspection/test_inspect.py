@@ -32,7 +32,7 @@ from curvireg_torch.inspection.trial import Expected, Outcome, Trial, run_trial
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.registration import Registrar
 from curvireg_torch.synthetic import example_mesh
-from tests._support import bank_around, bank_of, double, eye, refused, slow_after
+from tests._support import bank_around, bank_of, double, eye, refused, slow_after, unrefined
 from tests._support.spies import spied
 
 HALF_TURN = torch.diag(double([-1.0, -1.0, 1.0]))
@@ -66,15 +66,15 @@ def half_solid_box():
 
 @pytest.fixture(scope="module")
 def inspected(small_bank):
-    """A registrar, its report, and the progress of that."""
-    registrar = Registrar(small_bank, mesh_is="exact")
+    """The report of a registrar, and its progress."""
+    registrar = Registrar(small_bank, pipeline=unrefined(small_bank), mesh_is="exact")
     calls = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("curvireg_torch.inspection.look_alikes.LOOKED_AT", 12)
         report = cr.inspect(
             registrar, n=1, compare=False, progress=lambda *progress: calls.append(progress)
         )
-    return registrar, report, calls
+    return report, calls
 
 
 def test_facts_of_a_closed_body_and_of_its_triangles_apart():
@@ -313,7 +313,7 @@ def test_photographs_of_many_faces_show_a_simplified_mesh(monkeypatch, is_colour
 
 
 def test_trial_counts_right_and_reliable_and_stages_are_reported_in_order(inspected):
-    _, report, calls = inspected
+    report, calls = inspected
     assert report.trial.expected.n == 1
     assert not report.trial.compared
     stages = ["mesh", "look-alikes", "photographs"]  # the bank is there
@@ -372,7 +372,7 @@ def test_page_groups_symmetries_by_their_turn():
 
 
 def test_page_escapes_names(inspected):
-    _, report, _ = inspected
+    report, _ = inspected
     assert "<b>" not in report_page(report, title="<b>x").replace("<body>", "")
     assert any(line.startswith("size:") for line in report_lines(report))
 
