@@ -343,7 +343,7 @@ class CameraPanel(Panel):
     async def _set(self, count: int, typed: str) -> None:
         found = _typed_numbers(typed, count)
         if found is None:
-            self.workspace.messages["camera"] = (
+            self.workspace.errors["camera"] = (
                 f"camera: expected {EXPECTED[count]}, got {typed!r:.80}"
             )
             return

@@ -81,7 +81,7 @@ def test_gestures_come_as_fractions_and_become_a_box_in_px(workspace, build):
 
 def test_messages_are_text_and_not_html(workspace, build):
     steps = build(Steps)
-    workspace.messages["mesh"] = "a.ply: <b>empty</b>"
+    workspace.errors["mesh"] = "a.ply: <b>empty</b>"
     steps.refresh()
     assert steps.messages["mesh"].content == "a.ply: &lt;b&gt;empty&lt;/b&gt;"
     assert "disabled" in steps.find.props
