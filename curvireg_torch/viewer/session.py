@@ -22,7 +22,7 @@ from ..errors import (
 )
 from ..geometry import undistorted
 from ..geometry.calibration import Camera
-from ..geometry.cameras import transform
+from ..geometry.cameras import camera_numbers, transform
 from ..geometry.pose_prior import object_frame
 from ..jobs.entry import Entry, entry_of, prepare
 from ..jobs.opening import open_registrar
@@ -370,8 +370,7 @@ class Session:
         if shot.view is not None:  # the rig has boxes and cameras
             camera = None
         if isinstance(camera, Camera):
-            K = camera.matrix if shot.photo is None else camera.at(shot.size).matrix
-            camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+            camera = camera_numbers((camera if shot.photo is None else camera.at(shot.size)).matrix)
         photos = () if shot.photo is None else tuple(each.path for each in self.together())
         meshes = () if self.mesh_path is None else (self.mesh_path,)
         box = None if shot.view is not None else shot.box
