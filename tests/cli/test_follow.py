@@ -27,6 +27,7 @@ from curvireg_torch.registration import FailedRegistration, Follower
 from curvireg_torch.visualization import OverlayVideo
 from tests._support import (
     double,
+    eye,
     learned_registrar,
     sequence,
     slow_after,
@@ -39,6 +40,8 @@ from tests._support.lists import CAMERA, check_pose, table
 from tests._support.results import registration
 from tests._support.spies import spied
 from tests._support.tables import text_table
+
+SURE = registration(0.01 * eye(6))
 
 
 @pytest.fixture(scope="module")
@@ -317,7 +320,8 @@ def test_a_start_that_is_no_match_is_not_followed(monkeypatch, confidence, start
 
 def test_without_calibration_followed_poses_have_no_confidence(follow, tmp_path, monkeypatch):
     monkeypatch.setattr(following, "is_calibrated", lambda _: False)
-    assert follow(source="turn.avi", start=True) == 0
+    monkeypatch.setattr(Follower, "__call__", lambda *_: SURE)
+    assert follow(source="turn.avi") == 0
     rows = table(tmp_path)
     assert [(row["verdict"], row["confidence"]) for row in rows] == [("unsure", "")] * 3
 
@@ -358,7 +362,8 @@ def test_follow_keeps_the_poses_before_an_interruption(
     if source == "0":
         monkeypatch.setattr(cv2, "VideoCapture", lambda _: Mock(wraps=camera, read=read))
     monkeypatch.setattr(OverlayVideo, "add", interrupted)
-    assert follow(source=source, start=True) == code
+    monkeypatch.setattr(Follower, "__call__", lambda *_: SURE)
+    assert follow(source=source) == code
     verdicts = [row["verdict"] for row in table(tmp_path)]
     if source == "0":
         assert verdicts == ["reliable"]
