@@ -126,9 +126,9 @@ def register_options(
     try:
         limits = limits_from_options(vars(arguments))
         prior_from_limits(limits)
+        check_camera(camera)
     except InvalidInputError as error:
         raise InvalidInputError(f"--{error}") from error
-    check_camera(camera)
     check_device(given.get("device", "cpu"), "--device")
     options = RegisterOptions(
         photos=tuple(photos),

@@ -41,6 +41,17 @@ def camera_matrix(
     return K
 
 
+def camera_numbers(K: Tensor) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a (3, 3) camera matrix, as :func:`camera_matrix` takes them.
+
+    Example:
+        >>> camera_numbers(camera_matrix(800.0, 810.0, 319.5, 239.5))
+        (800.0, 810.0, 319.5, 239.5)
+    """
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    return fx, fy, cx, cy
+
+
 def camera_of_view(fov: float, size: Size) -> Tensor:
     """(3, 3) float64 camera matrix of a horizontal field of view, 0 < ``fov`` < 180 degrees, and an
     (H, W) in px, with square pixels and the principal point in the centre."""

@@ -389,10 +389,7 @@ def check_camera(camera: "tuple[float, ...] | Camera | str | float | None") -> N
     from ..geometry.cameras import camera_matrix, camera_of_view
     from ..utils.checks import check_square_pixels
 
-    try:
-        if isinstance(camera, tuple):
-            check_square_pixels(camera_matrix(*camera), "camera")
-        if isinstance(camera, float):
-            camera_of_view(camera, (1, 1))
-    except InvalidInputError as error:
-        raise InvalidInputError(f"--{error}") from error
+    if isinstance(camera, tuple):
+        check_square_pixels(camera_matrix(*camera), "camera")
+    if isinstance(camera, float):
+        camera_of_view(camera, (1, 1))

@@ -15,6 +15,7 @@ from torch import Tensor
 from ..data import load_camera
 from ..errors import CurviregError, InvalidInputError
 from ..geometry import Camera
+from ..geometry.cameras import camera_numbers
 from ..geometry.pose_prior import PosePrior
 from ..mesh import load_mesh
 from ..pipeline import Pipeline
@@ -313,9 +314,7 @@ def _registered(
             "photo": entry.name,
             "mesh": ", ".join(map(str, entry.meshes)),
             "box": box.tolist(),
-            "camera": None
-            if item.camera is None
-            else [float(item.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
+            "camera": None if item.camera is None else list(camera_numbers(item.K)),
             **item.facts,
         },
         "camera": camera and camera.describe(),

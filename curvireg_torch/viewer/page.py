@@ -75,7 +75,7 @@ def build_page(workspace: Workspace) -> None:
             for part in (camera, inputs, stage, answers, space, preview):
                 await part.refresh()
         except CurviregError as error:  # else all that comes after it would stand still
-            workspace.messages["page"] = workspace.session.without_folders(str(error))
+            workspace.errors["page"] = workspace.session.without_folders(str(error))
             steps.show_messages()
 
     ui.timer(TICK_SECONDS, refresh)

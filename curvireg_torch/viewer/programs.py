@@ -6,6 +6,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from ..geometry.cameras import camera_numbers
 from ..jobs.options import QUALIFIERS, RegisterOptions
 from ..jobs.photograph import RegisteredPhotograph
 from ..registration.photograph import Photograph
@@ -90,9 +91,7 @@ def _camera(photograph: Photograph) -> str:
     camera = photograph.camera
     if camera is None or camera.source == "exif":
         return ""
-    K = camera.matrix
-    numbers = [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
-    matrix = f"cr.camera_matrix({', '.join(map(str, numbers))})"
+    matrix = f"cr.camera_matrix{camera_numbers(camera.matrix)}"
     if not camera.focal_deviation:
         return matrix
     source = ", source='estimated'" if photograph.has_estimated_camera else ""

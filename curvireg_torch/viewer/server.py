@@ -245,12 +245,12 @@ def _add_page(workspace: Workspace) -> None:
             is_first = request.headers.get("x-first", "1") == "1"
             await workspace.receive(name, int(length), request.stream(), is_first=is_first)
         except InvalidInputError as error:
-            workspace.messages["file"] = str(error)
+            workspace.errors["file"] = str(error)
             return PlainTextResponse(
                 str(error), status_code=507 if isinstance(error, OutputError) else 413
             )
         except ClientDisconnect:
-            workspace.messages["file"] = f"{name}: it did not arrive; send it again"
+            workspace.errors["file"] = f"{name}: it did not arrive; send it again"
         return Response(status_code=204)
 
     ui.page("/")(lambda: build_page(workspace))

@@ -22,7 +22,7 @@ from ..errors import (
 )
 from ..geometry import undistorted
 from ..geometry.calibration import Camera
-from ..geometry.cameras import transform
+from ..geometry.cameras import camera_numbers, transform
 from ..geometry.pose_prior import object_frame
 from ..jobs.entry import Entry, entry_of, prepare
 from ..jobs.opening import open_registrar
@@ -287,9 +287,8 @@ class Session:
         """
         try:
             check_camera(camera)
-        except InvalidInputError as error:  # of the option of this name
-            words = str(error).replace("--fov", "field of view")
-            raise InvalidInputError(words.removeprefix("--")) from error
+        except InvalidInputError as error:
+            raise InvalidInputError(str(error).replace("fov", "field of view")) from error
         calibrated = isinstance(camera, Camera) or isinstance(self.options.camera, Camera)
         shots = [
             self._open_again(shot, None, camera) if calibrated and not shot.view else shot
@@ -319,11 +318,6 @@ class Session:
         # boxes of a BOP scene are those of the mesh
         if self.rig_path is not None and self.rig_path.is_dir():
             self.open_rig(self.rig_path)
-
-    @property
-    def has_exif(self) -> bool:
-        """Whether the photograph's file tells the focal length."""
-        return self.shot.photo is not None and self.shot.photo.guessed_camera_matrix() is not None
 
     def set_limits(self, **limits: Any) -> None:
         """Change what is known of the pose: arguments of :class:`PosePrior`; None removes a
@@ -376,8 +370,7 @@ class Session:
         if shot.view is not None:  # the rig has boxes and cameras
             camera = None
         if isinstance(camera, Camera):
-            K = camera.matrix if shot.photo is None else camera.at(shot.size).matrix
-            camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+            camera = camera_numbers((camera if shot.photo is None else camera.at(shot.size)).matrix)
         photos = () if shot.photo is None else tuple(each.path for each in self.together())
         meshes = () if self.mesh_path is None else (self.mesh_path,)
         box = None if shot.view is not None else shot.box

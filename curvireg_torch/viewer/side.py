@@ -25,7 +25,7 @@ from ..visualization.words import (
     used_camera_in_words,
     view_in_words,
 )
-from .shot import Answer, Numbers, Shot, numbers
+from .shot import Answer, Shot, numbers
 from .widgets import (
     Panel,
     button,
@@ -336,26 +336,18 @@ class CameraPanel(Panel):
                 self.view = field(
                     "or the horizontal field of view in degrees", "fov", partial(self._set, 1)
                 )
-                with region("div", "row"):
-                    file_chooser("From a file", "upload-camera")
-                    self.exif = button(
-                        "Guess from EXIF", lambda: self._set_camera("exif"), "exif", "quiet"
-                    )
+                file_chooser("From a file", "upload-camera")
             self.facts = fact_line("camera-facts")
             self.message = message_line("camera")
 
     async def _set(self, count: int, typed: str) -> None:
         found = _typed_numbers(typed, count)
         if found is None:
-            self.workspace.messages["camera"] = (
+            self.workspace.errors["camera"] = (
                 f"camera: expected {EXPECTED[count]}, got {typed!r:.80}"
             )
-        elif len(found) == 4:
-            await self._set_camera(numbers(found))
-        else:
-            await self._set_camera(found[0] if found else None)
-
-    async def _set_camera(self, camera: Numbers | str | float | None) -> None:
+            return
+        camera = numbers(found) if len(found) == 4 else next(iter(found), None)
         await self.workspace.run("camera", partial(self.session.set_camera, camera), stop=True)
 
     async def refresh(self) -> None:
@@ -366,7 +358,6 @@ class CameraPanel(Panel):
         show_value(self.view, (camera,) if isinstance(camera, float) else ())
         for element in (self.matrix, self.view):
             set_enabled(element, is_alone)
-        self.exif.set_visibility(self.session.has_exif and is_alone)
         set_text(self.facts, self._describe_camera())
         set_text(self.message, self.workspace.messages.get("camera", ""))
 
@@ -376,7 +367,8 @@ class CameraPanel(Panel):
         if shot.view is not None:
             words = "of each photograph, from the rig"
             return f"{words}, without its distortion" if shot.is_undistorted else words
-        if camera == "exif":
+        exif = None if shot.photo is None else shot.photo.camera()
+        if camera == "exif" or (camera is None and exif is not None):
             words = "from the photograph's EXIF"
             if shot.photo is None:
                 return words
@@ -390,8 +382,6 @@ class CameraPanel(Panel):
             return f"{words}, without its distortion" if camera.distorts else words
         if camera:
             return ""
-        if shot.photo is not None and shot.photo.camera() is not None:
-            return "from the photograph's EXIF"
         return "unknown: the focal length is estimated, and the distance with it"
 
 

@@ -65,8 +65,8 @@ class Workspace:
     Attributes:
         session: inputs and results.
         examination: of the mesh.
-        messages: errors and warnings about a part of the work: "file", "photograph", "rig", "mesh",
-            "camera", "pose", or the "page" itself.
+        errors: about a part of the work: "file", "photograph", "rig", "mesh", "camera", "pose", or
+            the "page" itself.
         files: pictures and downloads by name, with their media types.
         receiving: folders and names of files that are being received, and the bytes to come.
         started: when the search began, in seconds of ``time.monotonic``.
@@ -76,7 +76,7 @@ class Workspace:
         self.session = Session(options, folder)
         self.examination = Examination(self.session)
         self.folder = folder
-        self.messages: dict[str, str] = {}
+        self.errors: dict[str, str] = {}
         self.asks_for_unit = False
         self.refused_mesh: Path | None = None  # it may lack parts that come after it
         self._warnings: dict[str, str] = {}  # about what is open; they outlive an error
@@ -89,6 +89,13 @@ class Workspace:
         self._search: asyncio.Task[None] | None = None
         self._begun = False  # whether the search has waited for the jobs before it
         self._before_sample: RegisterOptions | None = None
+
+    @property
+    def messages(self) -> dict[str, str]:
+        """What is said about parts of the work: warnings, and errors below them."""
+        both = self._warnings.keys() & self.errors.keys()
+        joined = {part: f"{self._warnings[part]}\n{self.errors[part]}" for part in both}
+        return {**self._warnings, **self.errors, **joined}
 
     @property
     def searching(self) -> bool:
@@ -115,10 +122,8 @@ class Workspace:
 
     def forget_errors(self, *parts: str) -> None:
         """Show only the warnings about parts of the work, by default about all of it."""
-        for part in parts or tuple(self.messages):
-            self.messages.pop(part, None)
-            if warning := self._warnings.get(part):
-                self.messages[part] = warning
+        for part in parts or tuple(self.errors):
+            self.errors.pop(part, None)
 
     def pose_message(self) -> str:
         """What the last search, or job of its answer, has to say, where the inputs are its own."""
@@ -132,7 +137,8 @@ class Workspace:
         try:
             result = await asyncio.to_thread(job)
             if part in ("photograph", "mesh", "rig"):  # what the search said is outdated
-                self.messages.pop("pose", None)
+                self.errors.pop("pose", None)
+                self._warnings.pop("pose", None)
             self._keep_warnings(part, caught)
             return True if result is None else result
         except CurviregError as error:
@@ -151,19 +157,15 @@ class Workspace:
         """Show the warnings about what has been opened in place of those about what was open."""
         if part == "mesh":
             self.asks_for_unit = any(getattr(each, "kind", "") == "unit" for each in caught)
-        former = self._warnings.pop(part, "")
-        if former and self.messages.get(part) == former:
-            del self.messages[part]
+        self._warnings.pop(part, None)
         if caught:
-            words = "; ".join(map(str, caught))
-            self._warnings[part] = self.session.without_folders(words)
-            self._show(part, words)
+            self._warnings[part] = self.session.without_folders("; ".join(map(str, caught)))
 
     def _show(self, part: str, message: str) -> None:
-        """Show a message below those that stand there; uploaded files have their names alone."""
-        shown = self.messages.get(part, "").splitlines()
+        """Show an error below those that stand there; uploaded files have their names alone."""
+        shown = self.errors.get(part, "").splitlines()
         lines = [*shown, *self.session.without_folders(message).splitlines()]
-        self.messages[part] = "\n".join(dict.fromkeys(lines))
+        self.errors[part] = "\n".join(dict.fromkeys(lines))
 
     def start_search(self) -> asyncio.Task[None]:
         """Find the pose in the photograph that is shown, as soon as files are open; one search at a
@@ -383,7 +385,7 @@ class Workspace:
 
     async def load_sample(self) -> None:
         """Open the photograph of the sample, its mesh and its box."""
-        self.messages.clear()
+        self.errors.clear()
         self._warnings.clear()
         self.asks_for_unit = False
         await self.run("file", self._open_sample, stop=True)

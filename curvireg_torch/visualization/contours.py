@@ -38,11 +38,11 @@ SHORT = 0.06
 @dataclass(frozen=True)
 class Drawn:
     """What is drawn of an object: a mesh, by its describer, at ``T_cam_from_model`` (4, 4) with the
-    camera matrix (3, 3), a box in px below it, and an arrow from the start to the end of ``axis``
-    (2, 3) in the model's frame; None: not drawn."""
+    camera matrix (3, 3); a box in px below it, and an arrow from the start to the end of ``axis``
+    (2, 3) in the model's frame, unless these are None."""
 
     describer: ViewDescriber
-    projection: tuple[Tensor, Tensor] | None
+    projection: tuple[Tensor, Tensor]
     box: Sequence[float] | None = None
     axis: Tensor | None = None
 
@@ -93,11 +93,10 @@ def draw_window(
             corners = torch.tensor([[left, right], [top, bottom], [1.0, 1.0]]).double()
             thickness = _line_width(picture.shape[:2]) / 3
             _draw_rimmed(cv2.rectangle, picture, (resize @ corners)[:2].mT, BOX, thickness)
-        if each.projection is not None:
-            T, K = (x.cpu().double() for x in each.projection)
-            _paint(picture, contour_layer(each.describer, T, resize @ K, picture.shape[:2]))
-            if each.axis is not None:
-                _draw_axis(picture, each.axis.to(T), T, resize @ K)
+        T, K = (x.cpu().double() for x in each.projection)
+        _paint(picture, contour_layer(each.describer, T, resize @ K, picture.shape[:2]))
+        if each.axis is not None:
+            _draw_axis(picture, each.axis.to(T), T, resize @ K)
     return picture
 
 

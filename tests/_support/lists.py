@@ -16,6 +16,8 @@ from tests._support.scenes import errors, learned_registrar, scene, truck_bank, 
 from tests.registration.test_several import EASY, rig_of
 
 CAMERA = ["260", "260", "119.5", "89.5"]
+RIG_HEADER = "photo,x0,y0,x1,y1,fx,fy,cx,cy,r11,r12,r13,r21,r22,r23,r31,r32,r33,tx,ty,tz"
+"""The columns of a rig."""
 RESULTS = ["verdict", "message", "confidence", "reliable"]
 RESULTS += [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 RESULTS += ["tx", "ty", "tz", "exactness"]

@@ -22,10 +22,10 @@ from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import DEFAULT, PRESETS, ViewPolicy
 from scripts.robustness.wrong_inputs import cases
-from tests._support import double, slow_after, truck_bank
+from tests._support import double, slow_after, truck_bank, unrefined
+from tests._support.lists import box_of
 from tests._support.new_process import run_python
 from tests._support.small import SMALL
-from tests.viewer.test_session import write_scene
 
 
 def test_the_process_seldom_looks_for_cycles(monkeypatch):
@@ -131,7 +131,7 @@ def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
         "curvireg_torch.jobs.opening.cached_bank",
         lambda _, **given: options.update(given) or truck_bank(),
     )
-    monkeypatch.setattr(RegisterOptions, "open_pipeline", lambda _: truck_bank().pipeline)
+    monkeypatch.setattr(RegisterOptions, "open_pipeline", lambda _: unrefined(truck_bank()))
     assert main(["demo", "--out", str(tmp_path), "--quiet"]) == 0
     assert options["progress"] is False
     result = json.loads((tmp_path / "result.json").read_text())
@@ -155,13 +155,12 @@ def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("kind", slow_after(1, ["overlay", "fields", "viewpoints"]))
-def test_plot_draws_a_registration(folder, tmp_path, monkeypatch, kind):
-    monkeypatch.setenv("CURVIREG_CACHE", str(folder / "plotted"))
-    box, _ = write_scene(tmp_path)
-    words = ["--pipeline", str(tmp_path / "small.json"), "--quiet", "--box", *map(str, box)]
+def test_plot_draws_a_registration(folder, tmp_path, kind):
     out = tmp_path / f"{kind}.png"
-    files = [str(tmp_path / "photo.png"), str(tmp_path / "truck.ply")]
-    assert main(["plot", kind, *files, "--out", str(out), *words]) == 0
+    (tmp_path / "quick.json").write_text(unrefined(truck_bank()).to_json())
+    files = [str(folder / "photos" / "0.png"), str(folder / "truck.safetensors")]
+    words = ["--out", str(out), "--quiet", "--pipeline", str(tmp_path / "quick.json")]
+    assert main(["plot", kind, *files, *words, "--box", *box_of(0)]) == 0
     assert cv2.imread(str(out)).std() > 10
 
 

@@ -27,6 +27,7 @@ from curvireg_torch.registration import FailedRegistration, Follower
 from curvireg_torch.visualization import OverlayVideo
 from tests._support import (
     double,
+    eye,
     learned_registrar,
     sequence,
     slow_after,
@@ -39,6 +40,8 @@ from tests._support.lists import CAMERA, check_pose, table
 from tests._support.results import registration
 from tests._support.spies import spied
 from tests._support.tables import text_table
+
+SURE = registration(0.01 * eye(6))
 
 
 @pytest.fixture(scope="module")
@@ -107,9 +110,19 @@ def test_follow_says_that_it_is_not_sure(follow, monkeypatch, capsys):
     assert error.count("curvireg: not sure of the object yet (best confidence 0.10)") == 1
 
 
-def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
+def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys, monkeypatch):
+    """At once: a process that is killed leaves the poses before."""
     _, scenes = frames
+    rows = []
+    add = OverlayVideo.add
+
+    def watched(*arguments):
+        rows.append(len(table(tmp_path)))
+        add(*arguments)
+
+    monkeypatch.setattr(OverlayVideo, "add", watched)
     assert follow() == 0
+    assert rows == [1, 2, 3, 4]
     closing = capsys.readouterr().out
     assert "4 frames: 3 reliable, 0 unsure, 0 no match, 0 lost, 1 failed" in closing
     rate = re.search(r", ([\d.]+) frames per second; see", closing)
@@ -307,7 +320,8 @@ def test_a_start_that_is_no_match_is_not_followed(monkeypatch, confidence, start
 
 def test_without_calibration_followed_poses_have_no_confidence(follow, tmp_path, monkeypatch):
     monkeypatch.setattr(following, "is_calibrated", lambda _: False)
-    assert follow(source="turn.avi", start=True) == 0
+    monkeypatch.setattr(Follower, "__call__", lambda *_: SURE)
+    assert follow(source="turn.avi") == 0
     rows = table(tmp_path)
     assert [(row["verdict"], row["confidence"]) for row in rows] == [("unsure", "")] * 3
 
@@ -348,7 +362,8 @@ def test_follow_keeps_the_poses_before_an_interruption(
     if source == "0":
         monkeypatch.setattr(cv2, "VideoCapture", lambda _: Mock(wraps=camera, read=read))
     monkeypatch.setattr(OverlayVideo, "add", interrupted)
-    assert follow(source=source, start=True) == code
+    monkeypatch.setattr(Follower, "__call__", lambda *_: SURE)
+    assert follow(source=source) == code
     verdicts = [row["verdict"] for row in table(tmp_path)]
     if source == "0":
         assert verdicts == ["reliable"]
@@ -358,16 +373,8 @@ def test_follow_keeps_the_poses_before_an_interruption(
         assert [image.shape for _, image in Video(tmp_path / "overlay.mp4")] == [(3, 180, 240)]
 
 
-def test_follow_keeps_no_pose_in_memory_and_writes_each_at_once(follow, tmp_path, monkeypatch):
-    """A live video may last for days; a process that is killed leaves the poses before."""
-    rows = []
-    add = OverlayVideo.add
-
-    def watched(*arguments):
-        rows.append(len(table(tmp_path)))
-        add(*arguments)
-
-    monkeypatch.setattr(OverlayVideo, "add", watched)
+def test_follow_keeps_no_pose_in_memory():
+    """A live video may last for days."""
     tally = Tally()
     for number in range(1000):
         tally.add({"verdict": "reliable", "rotation": [number]}, 0.5)
@@ -375,8 +382,6 @@ def test_follow_keeps_no_pose_in_memory_and_writes_each_at_once(follow, tmp_path
     assert str(tally).startswith(
         "1000 frames: 1000 reliable, 0 unsure, 0 no match, 0 lost, 0 failed, 2.0 frames per"
     )
-    assert follow(start=True) == 0
-    assert rows == [1, 2, 3, 4]
 
 
 def test_follow_and_lists_do_not_overwrite_each_other(follow, tmp_path, capsys):

@@ -13,11 +13,14 @@ from curvireg_torch import Registrar, camera_matrix
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.printing import _advice, _print_rivals, print_result
 from curvireg_torch.cli.registering import _write_pose
+from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
-from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
+from curvireg_torch.jobs import photograph
+from curvireg_torch.pipeline import DEFAULT, PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from tests._support import bank_of, double, scene, slow_after, truck_bank
 from tests._support.lists import CAMERA, box_of, check_pose
+from tests._support.small import SMALL
 from tests._support.tables import text_table
 
 
@@ -30,11 +33,6 @@ def test_register_writes_result_and_overlay(registered, tmp_path, capsys):
     assert cv2.imread(str(tmp_path / "out" / "overlay.png")).std() > 20
     assert (np.shape(result["covariance"]), len(result["probabilities"])) == ((6, 6), 2)
     assert sum(result["probabilities"]) + result["no_match_probability"] == pytest.approx(1.0)
-    deviations = result["standard_deviations"]
-    assert deviations["translation"] == pytest.approx(
-        [result["covariance"][i][i] ** 0.5 for i in (3, 4, 5)]
-    )
-    assert all(0 < v < 30 for v in deviations["rotation_deg"])
     printed = capsys.readouterr().out
     assert "viewpoint" in printed
     assert "standard deviations: " in printed
@@ -45,12 +43,14 @@ def test_register_is_told_that_a_box_is_that_of_the_visible_part(registered):
         assert registered("--no-refine", *words)["pipeline"]["box_is"] == box_is
 
 
-def test_register_without_box_and_camera(folder, registered, capsys):
+def test_register_without_box_and_camera(folder, registered, capsys, monkeypatch):
     files = [str(folder / name) for name in ("photos/0.png", "truck.safetensors")]
     words = ["register", *files, "--no-refine", "--json"]
     assert main([*words, "--box", *box_of(0)]) == 0
     assert "detecting" not in capsys.readouterr().err
-    assert main(words) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(photograph, "_results_of", Mock(side_effect=LostObjectError("nowhere")))
+        assert main(words) == 2
     assert "0.png: detecting the object" in capsys.readouterr().err
     found = registered("--no-refine", "--mesh-is", "similar")
     assert capsys.readouterr().err == ""
@@ -65,6 +65,9 @@ def test_register_without_box_and_camera(folder, registered, capsys):
 def test_register_upright_mesh_with_another_up_axis(
     folder, registered, monkeypatch, name, options, up
 ):
+    views = ViewPolicy(azimuth_step=15.0, elevations=(0.0, 15.0, 30.0, 45.0))
+    pipeline = replace(PRESETS["classical"], views=views, bank=truck_bank().settings)
+    monkeypatch.setitem(PRESETS, DEFAULT, pipeline)
     monkeypatch.setenv("CURVIREG_CACHE", str(folder / "cache"))
     T = np.eye(4)
     T[:3, :3] = up_rotation(up).numpy().T
@@ -75,16 +78,16 @@ def test_register_upright_mesh_with_another_up_axis(
 
 
 def test_an_upright_mesh_that_is_not_recognised_is_told_which_axis_was_taken_as_up(
-    folder, registered, capsys
+    folder, registered, capsys, monkeypatch
 ):
     """OBJ names no axis; many programs write y up, and z is assumed."""
+    monkeypatch.setitem(PRESETS, DEFAULT, SMALL)
     mesh = example_mesh()
     mesh.vertices = mesh.vertices[:, [0, 2, 1]] * (1, 1, -1)
     mesh.export(folder / "y.obj")
     hint = "--pose upright: z of the mesh is taken as up; --up names another"
-    words = ("--pose", "upright", "--preset", "fast", "--unit", "m")
-    confidence = registered(*words, mesh="y.obj")["confidence"]
-    assert confidence is None or confidence < 0.5
+    words = ("--pose", "upright", "--unit", "m")
+    assert not registered(*words, mesh="y.obj")["reliable"]
     assert hint in capsys.readouterr().out
     registered(*words, "--up", "y", mesh="y.obj")
     assert hint not in capsys.readouterr().out
@@ -119,7 +122,7 @@ def test_register_takes_views_from_the_bank_unless_a_pipeline_file_is_given(
     assert "pose upright, " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("preset", slow_after(2, sorted(PRESETS, reverse=True)))
+@pytest.mark.parametrize("preset", slow_after(1, sorted(PRESETS, reverse=True)))
 def test_register_equals_registrar_bit_by_bit(folder, registered, monkeypatch, preset):
     monkeypatch.setenv("CURVIREG_CACHE", str(folder / "equal"))
     # The views of every preset, thinned out: 12 instead of 7200.
@@ -162,8 +165,7 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
 ):
     mesh = example_mesh()
     mesh.units = "mm"
-    views = {"views": truck_bank().views, "pipeline": PRESETS["classical"], "image_size": 96}
-    bank_of(mesh, **views).save(folder / "mm.safetensors")
+    bank_of(mesh, pipeline=SMALL).save(folder / "mm.safetensors")
     bank = {"mesh": "mm.safetensors"}
     refused(
         register_one("--unit", "m", "--no-refine", **bank),
@@ -177,7 +179,7 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
     assert registered(*words, **bank)["unit"] == "mm"
     assert register_one("--no-refine", **bank) == 0
     mesh.units = None
-    bank_of(mesh, **views).save(folder / "mm.safetensors")
+    bank_of(mesh, pipeline=SMALL).save(folder / "mm.safetensors")
     refused(
         register_one("--unit", "mm", "--no-refine", **bank), "mm.safetensors: built without a unit"
     )
@@ -192,24 +194,6 @@ def test_options_of_videos_and_processes_are_taken():
         assert parse(["register", *words.split(), "--out", "out"]).every in (1, 2)
     words = ["--list", "l.csv", "m.ply", "--front", "x", "--out", "out"]
     assert parse(["register", *words]).front == "x", "of the limits in its rows"
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("a.png b.png m.ply --format ros", "--format ros: of one result"),
-        ("shots/* m.ply --format visp", "--format visp: of one result"),
-        ("--list l.csv m.ply --format m3t", "--format m3t: of one result"),
-        ("a.png m.ply --start p.json --no-refine", "leave --no-refine out"),
-        ("--views r.csv m.ply --boxes b.json", "leave --boxes out"),
-        ("--views r.csv m.ply --camera exif", "the rig holds the cameras"),
-        ("--views r.csv m.ply --mask m.png", "a rig takes no masks"),
-    ],
-)
-def test_options_that_would_be_ignored_are_refused(words, said, capsys):
-    with pytest.raises(SystemExit):
-        parse(["register", *words.split(), "--out", "out"])
-    assert said in capsys.readouterr().err
 
 
 def test_the_pose_in_the_world_of_a_rig_is_no_start(folder, register_one, refused):

@@ -14,6 +14,7 @@ from curvireg_torch.cli import main
 from curvireg_torch.cli.register import NONE_RELIABLE
 from curvireg_torch.jobs.rigs import read_rig
 from tests._support.lists import (
+    RIG_HEADER,
     check_pose,
     write_bop_scene,
     write_colmap,
@@ -21,8 +22,6 @@ from tests._support.lists import (
     written,
 )
 from tests.registration.test_several import WORLD
-
-HEADER = "photo,x0,y0,x1,y1,fx,fy,cx,cy,r11,r12,r13,r21,r22,r23,r31,r32,r33,tx,ty,tz"
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +39,7 @@ def register(folder, rig, out, *words):
 def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, monkeypatch, capsys):
     place, rows = rig
     monkeypatch.setattr(Registration, "verdict", "unsure")
-    path = written(place / "rig.csv", HEADER, *rows, ["none.png", *rows[0][1:]])
+    path = written(place / "rig.csv", RIG_HEADER, *rows, ["none.png", *rows[0][1:]])
     assert register(folder, path, tmp_path, "--format", "ros", "--strict") == NONE_RELIABLE
     document = json.loads((tmp_path / "result.json").read_text())
     check_pose(document, WORLD, 1.5, 0.1 / float(WORLD[:3, 3].norm()))

@@ -86,6 +86,7 @@ def test_backgrounds_are_ones_own_photographs(tmp_path, inspect, monkeypatch):
         raise CurviregError("seen")
 
     monkeypatch.setattr("curvireg_torch.inspection.report.run_trial", trial)
+    monkeypatch.setattr("curvireg_torch.inspection.report.look_alikes", lambda *_: ())
     inspect("truck.ply", "--photo", str(tmp_path / "places"))
     red, green, blue = seen[0]
     assert red > 180
@@ -115,7 +116,8 @@ def test_a_mesh_without_area_is_refused_in_one_line(tmp_path, capsys, inspect):
 
 
 @pytest.mark.filterwarnings("default")
-def test_a_kilometre_and_missing_textures_are_warned_of(tmp_path, capsys, inspect):
+def test_a_kilometre_and_missing_textures_are_warned_of(tmp_path, capsys, inspect, monkeypatch):
+    monkeypatch.setattr("curvireg_torch.inspection.report.look_alikes", lambda *_: ())
     text = example_mesh().apply_scale(4000.0).export(file_type="obj")
     (tmp_path / "truck.obj").write_text("mtllib paint.mtl\nusemtl red\n" + text)
     code, out = inspect("truck.obj", "--n", "0")

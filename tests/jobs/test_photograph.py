@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from curvireg_torch.jobs.outputs import MARKER
 from tests._support import degrees_off, found_in, learned_registrar, refused, scene, two_trucks
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, write_files
+from tests._support.results import registration
 
 BOX = [*map(float, box_of(0))]
 FOUR = [*map(float, CAMERA)]
@@ -76,22 +78,20 @@ def test_register_detects_the_object_without_a_box(folder):
     assert (found.box - torch.tensor(BOX)).abs().max() < 12
 
 
-def test_register_takes_the_camera_from_exif(folder):
+def test_register_takes_the_camera_from_exif(folder, monkeypatch):
     photo = folder / "exif.png"
     cv2.imwrite(str(photo), cv2.imread(str(folder / "photos" / "0.png")))
     with_exif(photo, exif(1, 38))
-    guessed = cr.register(photo, learned_registrar(), box=BOX, camera="exif")
-    assert guessed.translation is not None
+    register = Mock()
+    monkeypatch.setattr(photograph, "register_entry", register)
+    cr.register(photo, learned_registrar(), box=BOX, camera="exif")
+    assert register.call_args.args[1].camera.source == "exif"
 
 
 def test_a_box_that_was_replaced_is_that_of_the_result(folder, monkeypatch):
     fits = torch.tensor([1.0, 2.0, 30.0, 40.0]).double()
-    original = cr.Registrar.register_prepared
-    monkeypatch.setattr(
-        cr.Registrar,
-        "register_prepared",
-        lambda *a, **k: [replace(original(*a, **k)[0], corrected_box=fits)],
-    )
+    answer = replace(registration(), corrected_box=fits)
+    monkeypatch.setattr(cr.Registrar, "register_prepared", lambda *_, **__: [answer])
     found = cr.register(folder / "photos" / "0.png", learned_registrar(), box=BOX)
     assert found.box.equal(fits)
 

@@ -79,7 +79,7 @@ def browser(folder, address):
     assert not errors
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="package")
 def registered(tmp_path_factory):
     """A session with a result, its folder and the true pose."""
     folder = tmp_path_factory.mktemp("viewer")

@@ -7,8 +7,14 @@ import os
 import pytest
 
 from tests._support.calibrations import calibration
-from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos, written
-from tests.viewer.test_rig import HEADER, send
+from tests._support.lists import (
+    RIG_HEADER,
+    write_bop_scene,
+    write_colmap,
+    write_rig_photos,
+    written,
+)
+from tests.viewer.test_rig import send
 
 IDENTITY = [1, 0, 0, 0, 1, 0, 0, 0, 1]
 CALIBRATION = calibration(260.0, 119.5, 89.5)
@@ -28,7 +34,7 @@ def outside(tmp_path):
 
 def rig_with_camera(folder, camera, name="rig.csv"):
     pose = [*IDENTITY, 0, 0, 1]
-    header = HEADER.replace("fx,fy,cx,cy", "camera")
+    header = RIG_HEADER.replace("fx,fy,cx,cy", "camera")
     written(folder / name, header, ["0.png", "", "", "", "", camera, *pose])
     return name
 
@@ -73,7 +79,7 @@ def test_photographs_of_a_rig_are_uploads_too(workspace, outside, tmp_path):
     (tmp_path / "scene_camera.json").write_text(
         json.dumps({f"../{up}/{k}": camera for k, camera in scene.items()})
     )
-    written(tmp_path / "rig.csv", HEADER, *rows)
+    written(tmp_path / "rig.csv", RIG_HEADER, *rows)
     for names in (("images.txt", "cameras.txt"), ("scene_camera.json",), ("rig.csv",)):
         session = send(workspace, tmp_path, *names)
         assert workspace.messages == {}

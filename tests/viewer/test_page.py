@@ -81,7 +81,7 @@ def test_gestures_come_as_fractions_and_become_a_box_in_px(workspace, build):
 
 def test_messages_are_text_and_not_html(workspace, build):
     steps = build(Steps)
-    workspace.messages["mesh"] = "a.ply: <b>empty</b>"
+    workspace.errors["mesh"] = "a.ply: <b>empty</b>"
     steps.refresh()
     assert steps.messages["mesh"].content == "a.ply: &lt;b&gt;empty&lt;/b&gt;"
     assert "disabled" in steps.find.props
@@ -113,22 +113,24 @@ def test_typed_numbers_go_into_the_session(workspace, build):
     assert typed(view="65,5") == 65.5
     assert shown() == ["", "65.5"]
     assert typed(view="") is None
-    asyncio.run(panel._set_camera("exif"))
+    session.set_camera("exif")
     refresh(panel)
     assert panel.facts.content.endswith("has no focal length")
     assert typed("") is None
     session.options = replace(session.options, camera=(300.0, 300.0, 119.5, 0.1 + 0.2))
     refresh(panel)
     assert shown() == ["300 300 119.5 0.30000000000000004", ""], "from another window"
-    asyncio.run(
-        panel._set_camera(Camera([[300.0, 0, 119.5], [0, 300, 89.5], [0, 0, 1]], (0.1, 0, 0, 0)))
-    )
+    session.set_camera(Camera([[300.0, 0, 119.5], [0, 300, 89.5], [0, 0, 1]], (0.1, 0, 0, 0)))
     refresh(panel, inputs)
     assert panel.facts.content == "from a calibration file, without its distortion"
     assert inputs.command.content.startswith("None: ")
-    asyncio.run(panel._set_camera("exif"))
+    session.set_camera()
+    session.shot.photo = replace(session.shot.photo, focal_35mm=37.0)
+    refresh(panel)
+    assert panel.facts.content.endswith("s EXIF, 37 mm of a 35 mm camera"), "unasked"
+    session.set_camera("exif")
     session.shot = Shot()
-    refresh(panel, inputs)
+    refresh(panel)
     assert panel.facts.content.endswith("s EXIF"), "of one that is still to come"
 
 

@@ -13,18 +13,22 @@ from torch.testing import assert_close
 from curvireg_torch.cli import main
 from curvireg_torch.geometry import Camera, rotation_error
 from curvireg_torch.jobs.options import RegisterOptions
-from curvireg_torch.jobs.rigs import BOX, CAMERA, ROTATION, TRANSLATION
+from curvireg_torch.jobs.rigs import CAMERA
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as session_module
 from curvireg_torch.viewer.workspace import Workspace
 from tests._support import double, learned_registrar, refused
 from tests._support.calibrations import calibration
-from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos, written
+from tests._support.lists import (
+    RIG_HEADER,
+    write_bop_scene,
+    write_colmap,
+    write_rig_photos,
+    written,
+)
 from tests.registration.test_several import WORLD
-from tests.viewer.test_session import document_of
+from tests.viewer.test_session import document_of, run_program
 from tests.viewer.test_workspace import started, upload
-
-HEADER = ",".join(["photo", *BOX, *CAMERA, *ROTATION, *TRANSLATION])
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +38,7 @@ def rig(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rig")
     rows = write_rig_photos(folder)
     rows[1][1:5] = [""] * 4
-    written(folder / "rig.csv", HEADER, *rows)
+    written(folder / "rig.csv", RIG_HEADER, *rows)
     learned_registrar().bank.save(folder / "truck.safetensors")
     return folder, rows
 
@@ -101,18 +105,14 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
         assert shot.answer is first.answer
     assert first.glb() == (tmp_path / "result" / "pose.glb").read_bytes()
     assert second.overlay() == (tmp_path / "result" / "overlay.png").read_bytes()
-    names = {}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        exec(session.python(), names)
-    assert names["pose"]["rotation"] == document["rotation"]
+    assert run_program(session, folder)["pose"]["rotation"] == document["rotation"]
 
 
 @pytest.fixture(scope="module")
 def found(rig, tmp_path_factory):
     """A workspace with the answer in two photographs of the rig, and a third photograph."""
     folder = rig[0]
-    workspace = Workspace(RegisterOptions(), tmp_path_factory.mktemp("uploads"))
+    workspace = Workspace(RegisterOptions(refine=False), tmp_path_factory.mktemp("uploads"))
     (folder / "other.png").write_bytes((folder / "1.png").read_bytes())
     session = send(workspace, folder, "rig.csv", "other.png", "0.png", "2.png", "truck.safetensors")
     search(workspace)
@@ -204,7 +204,7 @@ def test_a_calibration_that_comes_while_its_rig_goes_is_that_of_the_photographs(
 )
 def test_a_bad_rig_is_named_with_its_row(workspace, rig, tmp_path, column, value, message):
     folder, (first, *rows) = rig
-    written(tmp_path / "rig.csv", HEADER, [*first[:column], value, *first[column + 1 :]], *rows)
+    written(tmp_path / "rig.csv", RIG_HEADER, [*first[:column], value, *first[column + 1 :]], *rows)
     session = send(workspace, folder, "0.png")
     send(workspace, tmp_path, "rig.csv")
     assert workspace.messages["rig"].startswith(message)
@@ -218,7 +218,7 @@ def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photo
     workspace, rig, tmp_path
 ):
     folder, rows = rig
-    header = HEADER.replace(",".join(CAMERA), "camera")
+    header = RIG_HEADER.replace(",".join(CAMERA), "camera")
     written(tmp_path / "rig.csv", header, *([*row[:5], "cam.json", *row[9:]] for row in rows))
     content = calibration(260.0, 119.5, 89.5, dist=[-0.2, 0, 0, 0, 0])
     (tmp_path / "cam.json").write_text(content)

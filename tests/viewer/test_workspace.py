@@ -145,6 +145,9 @@ def test_a_mesh_of_a_doubtful_size_asks_for_its_unit_until_another_is_open(works
     first, second = workspace.messages["mesh"].splitlines()
     assert (first, second.split(": ")[0]) == (warning, "bad.ply")
     assert workspace.asks_for_unit
+    send(workspace, tmp_path / "small.stl", is_first=False)
+    assert workspace.messages["mesh"] == second
+    send(workspace, tmp_path / "large.stl")
     asyncio.run(workspace.set_option("unit", "mm"))
     assert (workspace.messages, workspace.asks_for_unit) == ({}, False)
     assert workspace.session.options.unit_is_given, "for banks, too"

@@ -6,33 +6,30 @@ import numpy as np
 import pytest
 import torch
 
-from curvireg_torch import Registrar
-from curvireg_torch.geometry import project_points
+from curvireg_torch.geometry import Camera, project_points
+from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization import sheet
 from curvireg_torch.visualization.contours import close_up
-from tests._support import scene, truck_bank, unrefined
+from tests._support import CAMERA, SIZE, scene, truck_registrar
 
 
 @pytest.mark.parametrize("scale", [1, 4])
 def test_thumbnail_draws_contours_on_the_object(scale):
     """The outline is the projection of the mesh after crop and resize."""
-    image, box, _ = scene(1)
-    large = torch.nn.functional.interpolate(image[None], scale_factor=scale, mode="bilinear")[0]
-    photograph = (large * 255).round().byte()
+    _, box, T = scene(1)
     edges = ((box + 0.5) * scale - 0.5).tolist()
-    registrar = Registrar(truck_bank(), pipeline=unrefined(truck_bank()))
-    result = registrar([photograph], [edges])[0]
-    grey = torch.full_like(photograph, 100)
-    jpeg = sheet.thumbnail(registrar.describer, result.projection, grey, edges)
+    H, W = SIZE
+    K = Camera(CAMERA, size=SIZE).at((H * scale, W * scale)).matrix
+    grey = torch.full((3, H * scale, W * scale), 100, dtype=torch.uint8)
+    describer = truck_registrar().describer
+    jpeg = sheet.thumbnail(describer, (T, K), grey, edges)
     pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1)
     y, x = np.nonzero(pixels[..., 1].astype(int) - pixels[..., 2] > 60)  # the outline's green
     assert len(x) > 50
     # Project the vertices into the thumbnail.
-    T, K = result.projection
-    uv = project_points(
-        torch.as_tensor(registrar.bank.mesh.vertices, dtype=torch.float64), T[None], K
-    )[0]
-    left, top, right, _ = close_up(photograph.shape[-2:], edges)
+    vertices = torch.as_tensor(example_mesh().vertices)
+    uv = project_points(vertices, T[None], K)[0]
+    left, top, right, _ = close_up(grey.shape[-2:], edges)
     shrink = pixels.shape[1] / (right - left)
     expected = [
         (v + 0.5 - start) * shrink - 0.5 for v, start in zip(uv.T, (left, top), strict=True)
