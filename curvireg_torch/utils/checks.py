@@ -41,10 +41,10 @@ def check_tensor(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None:
             f"{name}: expected a floating dtype, got {x.dtype}; convert with x.float() (images: "
             f"divide by 255)"
         )
-    check_dense(x, name)
+    _check_dense(x, name)
 
 
-def check_dense(x: Tensor, name: str) -> None:
+def _check_dense(x: Tensor, name: str) -> None:
     """``x`` has a layout and a dtype with which torch computes."""
     is_float8 = x.is_floating_point() and x.element_size() == 1
     if is_float8 or x.layout != torch.strided:
@@ -291,7 +291,7 @@ def as_tensor(values: Any, name: str) -> Any:
                 f"{name}: expected numbers of a dtype of torch, got {type_and_shape(values)}"
             ) from error
     if isinstance(x, Tensor):
-        check_dense(x, name)
+        _check_dense(x, name)
     return x
 
 
