@@ -5,9 +5,9 @@ import re
 from io import BytesIO
 from typing import TYPE_CHECKING
 
-from ..errors import MAX_IMAGE_BYTES, ImageError, MissingDependencyError
+from ..errors import MissingDependencyError
 from ..utils.extras import install_command
-from ..utils.pictures import check_pixels, decoding, open_picture
+from ..utils.pictures import open_picture
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -31,8 +31,9 @@ def heif_kind(data: bytes) -> str | None:
 
 
 def open_photograph(data: bytes) -> "Image":
-    """:func:`.open_picture`, and HEIC and AVIF too; pixels are not decoded yet. Pictures of HEIC
-    are turned as its properties say: their EXIF orientation is 1.
+    """:func:`.open_picture`, and HEIC and AVIF too, whose size the caller checks, within
+    :func:`.decoding`; pixels are not decoded yet. Pictures of HEIC are turned as its properties
+    say: their EXIF orientation is 1.
 
     Raises:
         MissingDependencyError: the decoder is not installed.
@@ -41,12 +42,7 @@ def open_photograph(data: bytes) -> "Image":
     kind = heif_kind(data)
     if kind is None:
         return open_picture(data)
-    if len(data) > MAX_IMAGE_BYTES:
-        raise ImageError(f"larger than {MAX_IMAGE_BYTES:,} bytes; save it smaller")
-    with decoding():
-        image = _heic(data) if kind == "HEIC" else _avif(data)
-    check_pixels(image)
-    return image
+    return _heic(data) if kind == "HEIC" else _avif(data)
 
 
 def _heic(data: bytes) -> "Image":

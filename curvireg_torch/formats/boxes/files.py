@@ -73,19 +73,16 @@ def read_boxes(file: Path) -> list[ImageBox]:
         >>> read_boxes(file)[0].corners, read_boxes(file)[0].score
         ((0.25, 0.375, 0.75, 0.625), 0.9)
     """
+    suffix = file.suffix.lower()
     try:
-        if file.suffix.lower() == ".txt":
-            return list(_yolo(_text(file)))
-        if file.suffix.lower() == ".xml":
-            return list(_xml(file))
-        return list(_json(read_json(file, (dict, list), README)))
+        if suffix not in (".txt", ".xml"):
+            return list(_json(read_json(file, (dict, list), README)))
+        check_table_size(file)
+        if suffix == ".xml":
+            return list(_xml(file.read_bytes()))
+        return list(_yolo(file.read_text(encoding="utf-8-sig", errors="replace")))
     except InvalidInputError as error:
         raise error.with_subject(file) from error
-
-
-def _text(file: Path) -> str:
-    check_table_size(file)
-    return file.read_text(encoding="utf-8-sig", errors="replace")
 
 
 def _refused(what: str) -> InvalidInputError:
@@ -243,10 +240,9 @@ def _size(height: Any, width: Any) -> Size | None:
 # ---- XML: Pascal VOC ----------------------------------------------------------------------------
 
 
-def _xml(file: Path) -> Iterator[ImageBox]:
-    check_table_size(file)
+def _xml(data: bytes) -> Iterator[ImageBox]:
     try:
-        root = read_xml(file.read_bytes())
+        root = read_xml(data)
     except ValueError as error:
         raise InvalidInputError(f"damaged, or no XML that is read ({error})") from error
     if root.tag == "annotations":

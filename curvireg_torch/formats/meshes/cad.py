@@ -248,9 +248,6 @@ def _check_copies(root: Any) -> None:
         return known[node]
 
     count(root, 0)
-    for node in root.iter():
-        if local_name(node) == "node":
-            count(node, 0)
 
 
 def _most_faces(geometry: Any) -> int:

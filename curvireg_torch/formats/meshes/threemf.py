@@ -130,9 +130,9 @@ class _Package:
         relations = "_rels/.rels"
         if relations in self._names:
             for one in read_xml(self._content(relations)):
-                target = one.get("Target", "")
-                if one.get("Type", "").endswith(f"/{_MODEL}") and self._has(target):
-                    return f"/{target.lstrip('/').lower()}"
+                target = one.get("Target", "").lstrip("/").lower()
+                if one.get("Type", "").endswith(f"/{_MODEL}") and target in self._names:
+                    return f"/{target}"
         models = [name for name in self._names if name.endswith(".model")]
         if not models:
             raise ValueError("no model in it")
@@ -236,9 +236,6 @@ class _Package:
                 return None
 
         return self._source.texture(path.lower(), read_content, path)
-
-    def _has(self, path: str) -> bool:
-        return path.lstrip("/").lower() in self._names
 
     def _content(self, path: str) -> bytes:
         name = self._names[path.lstrip("/").lower()]
