@@ -242,6 +242,8 @@ def test_read_image_refuses_truncated_other_and_missing_files(tmp_path, suffix):
         path.write_bytes(content)
         with refused(r"a\.\w+: (damaged or truncated|not an image)", ImageError):
             read_image(path)
+    with refused(r"a\.\w+: a web page", ImageError):
+        photo_of(path, b"<html><body>Not found")
     for path in (tmp_path / "nothing.jpg", tmp_path):
         with refused("no such file; check the path of the photograph", MissingFileError):
             read_image(path)
@@ -363,18 +365,6 @@ def test_exif_camera_respects_crops_and_pictures_of_pillow(tmp_path):
         assert torch.equal(camera.matrix, same.camera().matrix)
         assert (camera.source, camera.focal_deviation) == ("exif", 0.05)
         assert camera.matrix[:2, 2].tolist() == [(side - 1) / 2 for side in size[::-1]]
-
-
-@pytest.mark.parametrize(
-    ("start", "words"),
-    [
-        (b"version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS"),
-        (b"<html><body>Not found", "a web page"),
-    ],
-)
-def test_what_a_download_leaves_in_place_of_a_photograph_is_named(tmp_path, start, words):
-    with refused(rf"a\.jpg: {words}", ImageError):
-        photo_of(tmp_path / "a.jpg", start)
 
 
 def test_palettes_with_several_transparent_colours(tmp_path, recwarn):

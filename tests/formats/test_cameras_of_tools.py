@@ -317,11 +317,6 @@ def test_cameras_without_a_name_are_not_listed(write):
     check_camera(load_camera(f"{file}:color"), (), VGA)
 
 
-def test_what_a_download_leaves_in_place_of_a_calibration_is_named(read):
-    with refused("a pointer of Git LFS"):
-        read("version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n", "camera.yaml")
-
-
 MATLAB = {
     "FocalLength": [520.5, 522.0],
     "PrincipalPoint": [322.25, 239.5],

@@ -141,15 +141,9 @@ def test_load_mesh_reads_every_face_of_an_obj(write, line):
     assert (len(mesh.faces), abs(mesh.surface.volume)) == (12, pytest.approx(6.0))
 
 
-@pytest.mark.parametrize("kind", ["off", "obj", "ply"])
-def test_load_mesh_refuses_damaged_polygons(tmp_path, refused, kind):
-    path = tmp_path / f"u.{kind[:3]}"
+@pytest.mark.parametrize("kind", ["off", "ply"])
+def test_load_mesh_refuses_corners_that_do_not_exist(tmp_path, refused, kind):
+    path = tmp_path / f"u.{kind}"
     write(path, kind)
-    data = path.read_bytes()
-    for damaged in (
-        data.replace(b"\n8 7 6", b"\n8 99 6").replace(b"f 8 7 ", b"f 8 99 "),
-        data[: len(data) - 12],
-    ):
-        if kind == "obj" and damaged == data[:-12]:
-            continue  # a shorter OBJ is another OBJ
-        refused(path.name, damaged, path.name)
+    damaged = path.read_bytes().replace(b"\n8 7 6", b"\n8 99 6")
+    refused(path.name, damaged, "a face names a vertex that the file lacks")
