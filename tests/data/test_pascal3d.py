@@ -24,25 +24,20 @@ def cars(root, **options):
     return Pascal3DPlus(root, categories=["car"], **options)
 
 
-def test_pascal3d_counts_skipped_items(tmp_path):
-    reasons = write_pascal3d(tmp_path)
-    dataset = Pascal3DPlus(tmp_path)
+@pytest.mark.parametrize(("part", "other"), [("pascal", "imagenet"), ("imagenet", "pascal")])
+def test_pascal3d_counts_skipped_items_of_both_parts(tmp_path, part, other):
+    reasons = write_pascal3d(tmp_path, part=part)
+    dataset = Pascal3DPlus(tmp_path, part=part)
     assert (dataset.categories, len(dataset)) == (["car", "sofa"], 5)
     assert dict(dataset.skipped) == reasons
-    assert dataset.skipped_items["missing_image"] == ["car_pascal/2008_000009"]
+    assert dataset.skipped_items["missing_image"] == [f"car_{part}/2008_000009"]
     assert dataset.skipped_items["coarse_viewpoint"] == [
-        "car_pascal/2008_000003 #0",
-        "car_pascal/2008_000003 #1",
+        f"car_{part}/2008_000003 #0",
+        f"car_{part}/2008_000003 #1",
     ]
-
-
-def test_pascal3d_reads_the_imagenet_part(tmp_path):
-    reasons = write_pascal3d(tmp_path, part="imagenet")
-    dataset = Pascal3DPlus(tmp_path, part="imagenet")
-    assert (len(dataset), dict(dataset.skipped)) == (5, reasons)
-    assert dataset[0]["image_path"].endswith("car_imagenet/2008_000001.JPEG")
-    with refused("no pascal image list", MissingFileError):
-        Pascal3DPlus(tmp_path)
+    assert f"/car_{part}/2008_000001." in dataset[0]["image_path"]
+    with refused(f"no {other} image list", MissingFileError):
+        Pascal3DPlus(tmp_path, part=other)
 
 
 def test_pascal3d_returns_documented_samples(root):
@@ -111,22 +106,16 @@ def test_pascal3d_defaults_of_missing_camera_fields_and_invalid_cad_indices(root
     assert skipped["missing_mesh"] == before + len(invalid)
 
 
-def test_objects_without_a_class_are_corrupt(root):
+def test_flags_may_be_texts_and_objects_without_a_class_are_corrupt(root):
     record = root / "Annotations" / "car_pascal" / "2008_000001.mat"
+    flagged = [pascal_object("car", occluded=flag) for flag in ("1", "0", "yes")]
     nameless = pascal_object("car")
     del nameless["class"]
     before = cars(root).skipped
-    write_record(record, [nameless])
-    assert cars(root).skipped - before == {"corrupt_annotation": 1}
-
-
-def test_flags_may_be_texts(root):
-    record = root / "Annotations" / "car_pascal" / "2008_000001.mat"
-    before = cars(root).skipped
-    write_record(record, [pascal_object("car", occluded=flag) for flag in ("1", "0", "yes")])
+    write_record(record, [*flagged, nameless])
     dataset = cars(root)
     assert [dataset.annotation(i)["occluded"] for i in range(2)] == [True, False]
-    assert dataset.skipped - before == {"corrupt_annotation": 1}
+    assert dataset.skipped - before == {"corrupt_annotation": 2}
 
 
 def test_photographs_of_another_size_than_annotated_are_left_out(root):

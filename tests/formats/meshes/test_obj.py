@@ -82,14 +82,6 @@ def test_names_may_hold_number_signs_and_remarks_stand_behind_them(write, load):
     assert (mesh.colours.corners == [255, 0, 0]).all()
 
 
-def test_faces_of_a_textured_material_without_coordinates_are_named(write, load, tmp_path):
-    picture(tmp_path / "label.png")
-    write("a.mtl", "newmtl label\nmap_Kd label.png\n")
-    mesh, said = load(write("a.obj", f"mtllib a.mtl\n{POINTS}usemtl label\n{''.join(HALVES)}"))
-    assert len(mesh.faces) == 12
-    assert "faces of a textured material lack texture coordinates" in said[0]
-
-
 TEXTURE_OPTIONS = """
                                                                | [1, 1] | [0, 0]
 -s 1.000000 1.000000 1.000000                                  | [1, 1] | [0, 0]
