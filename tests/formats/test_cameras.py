@@ -80,6 +80,9 @@ COLMAP = """#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
 4 RADIAL 640 480 520.5 321.75 239 -0.31 0.12
 5 OPENCV 640 480 520.5 522 321.75 239 -0.31 0.12 0.001 -0.002
 6 OPENCV_FISHEYE 640 480 520.5 522 321.75 239 0.02 -0.01 0.003 -0.001
+7 FULL_OPENCV 640 480 520.5 522 321.75 239 -0.31 0.12 0.001 -0.002 0.03 0.5 0.6 0.7
+8 RADIAL_FISHEYE 640 480 520.5 321.75 239 0.02 -0.01
+9 FOV 640 480 520.5 522 321.75 239 0.1
 """
 
 
@@ -161,6 +164,10 @@ def test_colmap_counts_from_the_corner_of_the_picture(write):
     check(load_camera(f"{file}:4"), (-0.31, 0.12, 0.0, 0.0), fy=520.5)
     check(load_camera(f"{file}:5"), LENS[:4])
     check(load_camera(f"{file}:6"), FISHEYE, model="fisheye")
+    check(load_camera(f"{file}:7"), (*LENS, 0.5, 0.6, 0.7))
+    check(load_camera(f"{file}:8"), (0.02, -0.01, 0.0, 0.0), fy=520.5, model="fisheye")
+    with refused(r"line 10: expected CAMERA_ID MODEL .* FULL_OPENCV \(12\)"):
+        load_camera(f"{file}:9")
 
 
 def test_malicious_files_are_refused(tmp_path, write):
@@ -323,19 +330,6 @@ def test_metashape_counts_from_the_centre_and_swaps_the_tangential_coefficients(
         (-0.31, 0.12, 0.03, -0.001),
         model="fisheye",
     )
-
-
-def test_more_models_of_colmap(write):
-    file = write(
-        "cameras.txt",
-        "7 FULL_OPENCV 640 480 520.5 522 321.75 239 -0.31 0.12 0.001 -0.002 0.03 0.5 0.6 0.7\n"
-        "8 RADIAL_FISHEYE 640 480 520.5 321.75 239 0.02 -0.01\n9 FOV 640 480 520.5 522 321.75 239 "
-        "0.1\n",
-    )
-    check(load_camera(f"{file}:7"), (*LENS, 0.5, 0.6, 0.7))
-    check(load_camera(f"{file}:8"), (0.02, -0.01, 0.0, 0.0), fy=520.5, model="fisheye")
-    with refused(r"line 3: expected CAMERA_ID MODEL .* FULL_OPENCV \(12\)"):
-        load_camera(f"{file}:9")
 
 
 def test_ros_region_and_binning_are_applied(read):
