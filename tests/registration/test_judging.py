@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import Pipeline
@@ -21,7 +22,7 @@ from tests._support.hypotheses import (
     turned,
 )
 
-HULL = 0.3 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+HULL = 0.6 * torch.from_numpy(trimesh.creation.box().vertices)
 BOX = torch.tensor([90.0, 60.0, 150.0, 120.0])
 
 

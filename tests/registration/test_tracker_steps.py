@@ -8,6 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch.errors import ImageError
 from curvireg_torch.fitting.contour_problem import ContourState
@@ -27,7 +28,7 @@ def at(x=0.0, z=5.0):
     return pose([0.0, 0.0, 0.0], [x, 0.0, z])[None]
 
 
-HULL = 0.5 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+HULL = torch.from_numpy(trimesh.creation.box().vertices)
 PLATE = HULL * torch.tensor([1.0, 1.0, 0.0])
 
 
