@@ -93,12 +93,6 @@ def test_shares_are_equal_within_the_resolution_and_fall_with_the_slope_beyond(m
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_two_equal_poses_have_one_half_each_at_most(exact):
-    first, second = confidence.hypothesis_probabilities(1.0, torch.tensor([4.2, 4.2]), exact=exact)
-    assert first == second == 0.5
-
-
-@pytest.mark.parametrize("exact", [True, False])
 def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
     model = confidence.CALIBRATION["instance" if exact else "category"]
     assert set(model["weights"]) == set(confidence.CONFIDENCE_FEATURES)
