@@ -12,6 +12,8 @@ from tests._support.scenes import (
     bank_around,
     bank_of,
     bytes_bgr,
+    check_agreement,
+    check_near,
     degrees_off,
     errors,
     exact_registrar,

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import cv2
+import pytest
 import torch
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix, sample_views
@@ -97,8 +98,27 @@ def degrees_off(result, T):
 
 def errors(result, T):
     """Degrees, and the error of the position as a fraction of the distance."""
-    away = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
-    return float(degrees_off(result, T)), away
+    return pose_errors(result.transform, T)
+
+
+def pose_errors(found, T):
+    """:func:`errors` of a pose (4, 4)."""
+    away = float((found - T)[:3, 3].norm() / T[:3, 3].norm())
+    return float(rotation_error(found[:3, :3], T[:3, :3])), away
+
+
+def check_near(found, T, degrees, share):
+    """A pose (4, 4) is that near to the true one."""
+    turned, moved = pose_errors(found, T)
+    assert turned < degrees
+    assert moved < share
+
+
+def check_agreement(one, other):
+    """Two results of one photograph agree to .05 degrees, and .01 of confidence."""
+    assert rotation_error(one.rotation, other.rotation) < 0.05
+    assert other.confidence == pytest.approx(one.confidence, abs=0.01)
+    assert other.verdict == one.verdict
 
 
 @cache
