@@ -68,9 +68,9 @@ def bank_around(mesh, step, elevations, **options):
     return bank_of(mesh, views, **{"image_size": 96} | options)
 
 
-def answer_of(registrar, image, box):
-    """The result of one photograph of ``CAMERA``."""
-    return registrar([image], box[None], CAMERA)[0]
+def answer_of(registrar, image, box, camera=CAMERA, **options):
+    """The result of one photograph, by default of ``CAMERA``."""
+    return registrar([image], box[None], camera, **options)[0]
 
 
 def answer_to(seed, registrar):

@@ -28,6 +28,7 @@ from tests._support import (
     seeded,
     skip_unless_products_are_exact,
     slow_after,
+    zeros,
 )
 from tests.fitting.cube import (
     BOX,
@@ -341,7 +342,7 @@ def several():
         truth = random_pose(cube(), camera, size, generator)
         image, box = synthesize_photograph(cube(), truth, camera, size, generator)
         photographs.append(((255 * image).round().byte(), box, camera))
-        starts.append(apply_twist(truth.repeat(2, 1, 1), off, torch.zeros(3).double()))
+        starts.append(apply_twist(truth.repeat(2, 1, 1), off, zeros(3)))
     images, boxes, cameras = zip(*photographs, strict=True)
     order = torch.tensor([3, 0, 4, 1, 2])
     return images, torch.stack(boxes), torch.stack(cameras), torch.cat(starts)[order], order // 2

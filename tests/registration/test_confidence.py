@@ -29,6 +29,7 @@ from tests._support import (
     slow_after,
     truck_answer,
     truck_registrar,
+    zeros,
 )
 from tests._support.hypotheses import evidence_of
 from tests._support.results import FEATURES
@@ -153,7 +154,7 @@ def test_undetermined_axes():
 
 def test_one_unknown_axis_counts_once_in_any_direction():
     axis = torch.nn.functional.normalize(double([1.0, 1.0, 0.8]), dim=0)
-    covariance = torch.zeros(6, 6, dtype=torch.float64)
+    covariance = zeros(6, 6)
     covariance[:3, :3] = math.pi**2 * torch.outer(axis, axis)
     assert confidence.undetermined_axes(covariance) == pytest.approx(1.0)
 
@@ -190,7 +191,7 @@ def test_confidence_is_that_of_the_reported_features(seed, camera):
     image, box, _ = scene(seed)
     exact = camera is not None
     registrar = exact_registrar(learned_registrar().bank, mesh_is=None if exact else "similar")
-    result = registrar([image], box[None], camera)[0]
+    result = answer_of(registrar, image, box, camera)
     any_right = confidence.probability_of_any(result.confidence_features, exact=exact)
     weights = vars(registrar.score_weights(exact=exact))
     scores = [
@@ -230,7 +231,7 @@ def test_evidence_is_measured_at_the_reported_pose():
     registrar = truck_registrar()
     describer, (image, box, _) = registrar.describer, scene(0)
     query = describer.descriptor(registrar.matcher.query([image], box[None]).field)
-    without_camera = registrar([image], box[None])[0]
+    without_camera = answer_of(registrar, image, box, None)
     for h in (*truck_answer().hypotheses, *without_camera.hypotheses):
         distance = double([h.distance])
         view = describer.descriptors(h.allocentric_rotation[None], distance)

@@ -29,6 +29,7 @@ from curvireg_torch.synthetic import example_mesh, procedural_background
 from curvireg_torch.visualization.words import corners
 from tests._support import (
     CAMERA,
+    answer_of,
     bank_of,
     check_agreement,
     check_near,
@@ -183,7 +184,7 @@ def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail(registra
     first."""
     image, box = pasted_scene(5, (200, 120), 0.45)
     K = cr.camera_matrix(150.0, 150.0, 159.5, 119.5)
-    alone = registrar([image], box[None], K)[0]
+    alone = answer_of(registrar, image, box, K)
     prior = PosePrior(rotation=alone.rotation, within=2.0)
     far = torch.tensor([[4.0, 4.0, 44.0, 44.0], [4.0, 190.0, 44.0, 230.0]])
     monkeypatch.setattr(registrar, "detector", fixed(torch.cat([far, box[None]]), [9.0, 8.0, 7.0]))

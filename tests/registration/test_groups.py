@@ -14,12 +14,12 @@ from curvireg_torch.registration.judging import Rivals, axis_of, directions_agre
 from curvireg_torch.registration.result import AXIS_TOLERANCE, Axis
 from curvireg_torch.visualization.contours import AXIS
 from curvireg_torch.visualization.overlay import contour_overlay, registration_sheet
-from tests._support import answer_of, bank_around, double, exact_registrar
+from tests._support import answer_of, bank_around, double, exact_registrar, zeros
 from tests._support.canisters import canister
 from tests._support.results import FEATURES, registration
 from tests.registration.test_ties import photograph
 
-UPRIGHT = RoundAxis(double([0.0, 0.0, 1.0]), torch.zeros(3).double(), False)
+UPRIGHT = RoundAxis(double([0.0, 0.0, 1.0]), zeros(3), False)
 
 
 def turned(*viewpoints):

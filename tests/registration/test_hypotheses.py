@@ -19,7 +19,7 @@ from curvireg_torch.registration.hypotheses import (
     distinct_poses,
     placed,
 )
-from tests._support import CAMERA, check_near, double, scene, truck_bank, truck_registrar
+from tests._support import CAMERA, check_near, double, scene, truck_bank, truck_registrar, zeros
 from tests._support.hypotheses import evidence_of, placed_at, poses_at, target_of
 
 WEIGHTS = EvidenceWeights.only(similarity=10.0)
@@ -70,7 +70,7 @@ def test_edges_are_measured_once_at_a_pose(monkeypatch):
     target = target_of(describer=None)
     assert block_module._contours(target, crops, poses).tolist() == [0.2, 0.7]
     assert measured == [1]
-    elsewhere = placed(poses, poses.T.flip(0), torch.zeros(3).double())
+    elsewhere = placed(poses, poses.T.flip(0), zeros(3))
     assert block_module._contours(target, crops, elsewhere).tolist() == [0.7, 0.7]
     known = replace(poses, edge_excess=double([0.2, 0.3]))
     assert block_module._contours(target, crops, known).tolist() == [0.2, 0.3]

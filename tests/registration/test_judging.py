@@ -12,7 +12,7 @@ from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import stages
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import judged
-from tests._support import CAMERA, SIZE, double, eye
+from tests._support import CAMERA, SIZE, double, eye, zeros
 from tests._support.hypotheses import (
     HALF_TURN,
     competing,
@@ -53,7 +53,7 @@ def judgement(
     target = target_of(
         pipeline=pipeline or Pipeline(),
         bank=SimpleNamespace(views=SimpleNamespace(rotations=turned(0.0, 90.0, 180.0).float())),
-        describer=SimpleNamespace(hull=HULL, centre=torch.zeros(3).double()),
+        describer=SimpleNamespace(hull=HULL, centre=zeros(3)),
         round_axis=None,
         mesh_warnings=("of the mesh",),
         mesh_notes=("note",),

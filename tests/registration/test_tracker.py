@@ -32,14 +32,24 @@ from curvireg_torch.registration.tracking import FLOW_SCALES, Tracker
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
-from tests._support import CAMERA, check_near, double, eye, refused, seeded, sequence, uniform
+from tests._support import (
+    CAMERA,
+    check_near,
+    double,
+    eye,
+    refused,
+    seeded,
+    sequence,
+    uniform,
+    zeros,
+)
 from tests.fitting.cube import cube, pose
 
 K = camera_matrix(500.0, 500.0, 159.5, 119.5)
 SIZE = (240, 320)
 START = pose([0.4, 0.5, 0.1], [0.0, 0.0, 6.0])
 WINDOW_K = double([[[400.0, 0, 127.5], [0, 400.0, 127.5], [0, 0, 1]]])
-ZERO = torch.zeros(3, dtype=torch.float64)
+ZERO = zeros(3)
 
 
 def make_tracker(mesh):
