@@ -28,6 +28,7 @@ from tests._support.scenes import (
     found_in,
     learned_answer,
     learned_registrar,
+    photograph_of,
     scene,
     seen_from,
     sequence,

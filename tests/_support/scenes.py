@@ -58,6 +58,12 @@ def seen_from(mesh, azimuth, elevation, radii):
     return transform(R, ahead - R @ mesh_centre(mesh))
 
 
+def photograph_of(mesh, azimuth, elevation, seed, radii=5.0):
+    """(3, H, W) that shows a mesh so, its box (4,) and the true ``T_cam_from_model``."""
+    T = seen_from(mesh, azimuth, elevation, radii)
+    return (*synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(seed)), T)
+
+
 def bank_of(mesh, views=None, **options):
     return ViewBank.build(mesh, views, progress=False, **options)
 

@@ -11,10 +11,9 @@ import curvireg_torch as cr
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.registration import refinement
-from curvireg_torch.synthetic import procedural_background, synthesize_photograph
+from curvireg_torch.synthetic import procedural_background
 from tests._support import (
     CAMERA,
-    SIZE,
     answer_of,
     bank_around,
     check_near,
@@ -22,10 +21,10 @@ from tests._support import (
     double,
     exact_registrar,
     learned_registrar,
+    photograph_of,
     refused,
     scene,
     seeded,
-    seen_from,
     slow_after,
     truck_registrar,
 )
@@ -149,8 +148,7 @@ def test_poses_that_look_alike_are_confirmed_by_the_same_registration(number):
     """A cuboid, from its true pose and from that which a half turn makes of it."""
     mesh = trimesh.creation.box((0.2, 0.3, 0.15))
     registrar = exact_registrar(bank_around(mesh, 30, [0, 30, 60]))
-    T = seen_from(mesh, 30.0, 30.0, radii=6.1)
-    image, _ = synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(0))
+    image, _, T = photograph_of(mesh, 30.0, 30.0, 0, radii=6.1)
     symmetries = registrar.symmetries_of(exact=True).double()
     true, turned = registrar.refine([image] * 2, CAMERA, [T, T @ symmetries[number]])
     assert turned.confidence == pytest.approx(true.confidence, abs=0.02)

@@ -35,7 +35,7 @@ from curvireg_torch.registration import (
 from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration.photograph import Photograph, as_photograph, check_crop
 from curvireg_torch.rendering import make_renderer, render_depth
-from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from curvireg_torch.synthetic import example_mesh
 from tests._support import (
     CAMERA,
     SIZE,
@@ -49,10 +49,9 @@ from tests._support import (
     first_scenes,
     learned_answer,
     learned_registrar,
+    photograph_of,
     refused,
     scene,
-    seeded,
-    seen_from,
     truck_answer,
     truck_bank,
     truck_registrar,
@@ -402,13 +401,9 @@ def half_way():
     """A coarse bank, and photographs and boxes of poses half-way between two of its views, both of
     which lead there."""
     mesh = example_mesh()
-    shown = [
-        synthesize_photograph(
-            mesh, seen_from(mesh, azimuth, 20.0, radii=3.5), CAMERA, SIZE, seeded(1)
-        )
-        for azimuth in (15.0, 45.0, 75.0, 225.0)
-    ]
-    images, boxes = zip(*shown, strict=True)
+    azimuths = (15.0, 45.0, 75.0, 225.0)
+    shown = [photograph_of(mesh, azimuth, 20.0, 1, radii=3.5) for azimuth in azimuths]
+    images, boxes, _ = zip(*shown, strict=True)
     return bank_around(mesh, 30, [20], pipeline=PRESETS["classical"]), images, torch.stack(boxes)
 
 
