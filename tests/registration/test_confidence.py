@@ -8,8 +8,6 @@ import trimesh
 
 from curvireg_torch import Pipeline, Registrar, rotation_error, sample_views
 from curvireg_torch.evidence import EvidenceWeights
-from curvireg_torch.fitting.edges import EdgeCrops
-from curvireg_torch.fitting.measured_fit import edges_at
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.pipeline import PRESETS, FitSettings
@@ -33,6 +31,7 @@ from tests._support import (
 )
 from tests._support.hypotheses import evidence_of
 from tests._support.results import FEATURES
+from tests.fitting.cube import edges_in
 
 R30 = sample_views(azimuth_step=12, elevations=[0]).rotations
 
@@ -240,8 +239,7 @@ def test_evidence_is_measured_at_the_reported_pose():
         )
         T, K = h.projection
         assert h.distance == pytest.approx(float((T[:3, :3] @ describer.centre + T[:3, 3]).norm()))
-        crops = EdgeCrops.cut([image], box[None], describer.settings.margin)
-        support, _ = edges_at(describer.contours, crops, K[None], T[None], torch.tensor([0]))
+        support, _ = edges_in(image, box, describer.contours, K, T[None])
         assert h.edge_support == pytest.approx(float(support), abs=0.03)
         # without that term
         assert (h.evidence["edge_support"], h.evidence["appearance"]) == (h.edge_support, 0.0)
