@@ -29,7 +29,7 @@ from curvireg_torch.geometry import (
 )
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.matching.search import BEST_VIEWS, coherent_of, different_views, refine, search
-from curvireg_torch.mesh import Mesh, load_mesh
+from curvireg_torch.mesh import Mesh
 from curvireg_torch.pipeline import FIELDS, PRESETS, BankSettings, Pipeline, ViewPolicy
 from scripts._shared import RIGHT_DEG, Record
 from scripts.paper.cases import Case
@@ -96,9 +96,13 @@ def detected(crop: Tensor, share: float) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def measure_points(cases: list[Case], settings: BankSettings, _pose: str) -> list[Record]:
+def measure_points(
+    mesh: Mesh,
+    cases: list[Case],
+    settings: BankSettings,
+    _pose: str,
+) -> list[Record]:
     """Agreement of the points of photographs with those of the views at their true poses."""
-    mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
     describers = {
         name: ViewDescriber(mesh, replace(settings, depth_field=name)) for name in REPEATED_DEPTHS
     }
@@ -162,10 +166,14 @@ def _turns_about_z() -> Tensor:
 
 
 @torch.no_grad()
-def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[Record]:
+def measure_views(
+    mesh: Mesh,
+    cases: list[Case],
+    settings: BankSettings,
+    pose: str,
+) -> list[Record]:
     """Rankings of all views, and the poses that the paper's search finds, for each pair of
     filters."""
-    mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
     describe = ViewDescriber(mesh, settings)
     views = [case.view(mesh)[0] for case in cases]
     truths = [Truth(case, R, describe) for case, R in zip(cases, views, strict=True)]
@@ -283,10 +291,14 @@ def _closest_refined(matcher: ViewMatcher, crop: Tensor, truth: Truth) -> list[f
 
 
 @torch.no_grad()
-def measure_focus(cases: list[Case], settings: BankSettings, pose: str) -> list[Record]:
+def measure_focus(
+    mesh: Mesh,
+    cases: list[Case],
+    settings: BankSettings,
+    pose: str,
+) -> list[Record]:
     """IP and the best views of focus curves by threshold, and of the fields beside them, in the
     ranking "corrected"; and what of them is right by other protocols."""
-    mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
     pipeline = sized(variants(pose)["corrected"], settings)
     bank = ViewBank.build(mesh, pipeline=pipeline, progress=False)
     matcher = ViewMatcher(bank, pipeline=pipeline)

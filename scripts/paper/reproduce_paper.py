@@ -39,6 +39,7 @@ sys.path.insert(0, str(REPOSITORY))
 
 from curvireg_torch.errors import MissingDependencyError
 from curvireg_torch.evaluation import DATASETS
+from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.utils.files import write_file
 from scripts._shared import (
@@ -91,7 +92,8 @@ def measure(
     """Records of the cases of one mesh."""
     from scripts.paper.measure import MEASURES
 
-    found = MEASURES[phase](cases, settings, pose)
+    mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
+    found = MEASURES[phase](mesh, cases, settings, pose)
     same = {"cad": cases[0].mesh_path, "commit": commit()}
     return [
         {"category": case.category, **same, **record}

@@ -1,7 +1,14 @@
 """What many tests use: small scenes, numbers, and refusals."""
 
 # ruff: noqa: F401
-from tests._support.numbers import double, eye, seeded, skip_unless_products_are_exact, uniform
+from tests._support.numbers import (
+    double,
+    eye,
+    seeded,
+    skip_unless_products_are_exact,
+    uniform,
+    zeros,
+)
 from tests._support.quick import slow_after
 from tests._support.refusals import refused
 from tests._support.scenes import (
@@ -12,6 +19,8 @@ from tests._support.scenes import (
     bank_around,
     bank_of,
     bytes_bgr,
+    check_agreement,
+    check_near,
     degrees_off,
     errors,
     exact_registrar,
@@ -19,6 +28,7 @@ from tests._support.scenes import (
     found_in,
     learned_answer,
     learned_registrar,
+    photograph_of,
     scene,
     seen_from,
     sequence,

@@ -12,6 +12,10 @@ def eye(n):
     return torch.eye(n, dtype=torch.float64)
 
 
+def zeros(*shape):
+    return torch.zeros(shape, dtype=torch.float64)
+
+
 def seeded(seed):
     return torch.Generator().manual_seed(seed)
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import cv2
+import pytest
 import torch
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix, sample_views
@@ -57,6 +58,12 @@ def seen_from(mesh, azimuth, elevation, radii):
     return transform(R, ahead - R @ mesh_centre(mesh))
 
 
+def photograph_of(mesh, azimuth, elevation, seed, radii=5.0):
+    """(3, H, W) that shows a mesh so, its box (4,) and the true ``T_cam_from_model``."""
+    T = seen_from(mesh, azimuth, elevation, radii)
+    return (*synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(seed)), T)
+
+
 def bank_of(mesh, views=None, **options):
     return ViewBank.build(mesh, views, progress=False, **options)
 
@@ -67,9 +74,9 @@ def bank_around(mesh, step, elevations, **options):
     return bank_of(mesh, views, **{"image_size": 96} | options)
 
 
-def answer_of(registrar, image, box):
-    """The result of one photograph of ``CAMERA``."""
-    return registrar([image], box[None], CAMERA)[0]
+def answer_of(registrar, image, box, camera=CAMERA, **options):
+    """The result of one photograph, by default of ``CAMERA``."""
+    return registrar([image], box[None], camera, **options)[0]
 
 
 def answer_to(seed, registrar):
@@ -97,8 +104,27 @@ def degrees_off(result, T):
 
 def errors(result, T):
     """Degrees, and the error of the position as a fraction of the distance."""
-    away = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
-    return float(degrees_off(result, T)), away
+    return pose_errors(result.transform, T)
+
+
+def pose_errors(found, T):
+    """:func:`errors` of a pose (4, 4)."""
+    away = float((found - T)[:3, 3].norm() / T[:3, 3].norm())
+    return float(rotation_error(found[:3, :3], T[:3, :3])), away
+
+
+def check_near(found, T, degrees, share):
+    """A pose (4, 4) is that near to the true one."""
+    turned, moved = pose_errors(found, T)
+    assert turned < degrees
+    assert moved < share
+
+
+def check_agreement(one, other):
+    """Two results of one photograph agree to .05 degrees, and .01 of confidence."""
+    assert rotation_error(one.rotation, other.rotation) < 0.05
+    assert other.confidence == pytest.approx(one.confidence, abs=0.01)
+    assert other.verdict == one.verdict
 
 
 @cache

@@ -25,6 +25,7 @@ from curvireg_torch.registration.photograph import as_photographs
 from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background
 from tests._support import (
+    answer_of,
     bank_of,
     degrees_off,
     double,
@@ -32,6 +33,7 @@ from tests._support import (
     eye,
     seeded,
     slow_after,
+    zeros,
 )
 
 SIZE = (360, 480)
@@ -101,7 +103,7 @@ def photograph(*poses, shown=None):
 
 def answer(registrar, T, **options):
     """The registration of a photograph of the carton at T."""
-    return registrar([photograph(T)], box_of(T)[None], K, **options)[0]
+    return answer_of(registrar, photograph(T), box_of(T), K, **options)
 
 
 def box_of(T):
@@ -201,7 +203,7 @@ def test_keypoints_decide_where_most_of_the_object_is_hidden():
     hidden = slice(int(box[1] + 0.4 * (box[3] - box[1])), None)
     image[:, hidden] = photograph()[:, hidden]
     around = registrar_of(azimuth_step=90, elevations=[0, 45])
-    result = around([image], box[None], K)[0]
+    result = answer_of(around, image, box, K)
     assert degrees_off(result, T) < 5.0
     first, *others = (h.evidence["keypoints"] for h in result.hypotheses)
     assert first > max(others)
@@ -259,7 +261,7 @@ def test_registration_starts_from_keypoints_too(monkeypatch):
     """No view of the bank is near the pose."""
     T = pose(65.0)
     assert degrees_off(answer(registrar(), T), T) < 1.0
-    nothing = torch.zeros(0, 4, 4, dtype=torch.float64), torch.zeros(0)
+    nothing = zeros(0, 4, 4), torch.zeros(0)
     monkeypatch.setattr(KeypointMatches, "poses", lambda *_: nothing)
     assert degrees_off(answer(registrar(), T), T) > 10.0
 

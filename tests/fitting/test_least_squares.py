@@ -15,7 +15,7 @@ from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.rendering.contours import ContourPoints
-from tests._support import double, eye, seeded, skip_unless_products_are_exact, uniform
+from tests._support import double, eye, seeded, skip_unless_products_are_exact, uniform, zeros
 from tests.fitting.cube import K, fitted, pose, random_points, silhouette
 
 ZERO = double([0.0, 0.0, 0.0])
@@ -68,7 +68,7 @@ def test_damping_shortens_each_direction_alike():
         b = unit @ A @ torch.ones(1, 6, 1, dtype=torch.float64)
         x = ls.damped_solution(in_units, b, 0.25)
         assert_close(x @ unit, torch.full((1, 6), 0.8, dtype=torch.float64))
-    assert ls.damped_solution(0 * A, torch.zeros(1, 6, 1).double(), 0.01).tolist() == [[0.0] * 6]
+    assert ls.damped_solution(0 * A, zeros(1, 6, 1), 0.01).tolist() == [[0.0] * 6]
 
 
 def test_points_need_a_minimum_of_matches():

@@ -28,7 +28,7 @@ from curvireg_torch.mesh.mesh import extreme_points, mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.contours import MeshContours
-from tests._support import CAMERA, bank_of, double, exact_registrar, slow_after
+from tests._support import CAMERA, answer_of, bank_of, double, exact_registrar, slow_after, zeros
 from tests._support.cans import can, photograph
 from tests.fitting.cube import crops_of, edges_in
 
@@ -47,7 +47,7 @@ def renderer():
 
 def turned_can(degrees):
     """The true pose, turned about the can's axis: its contours are the same."""
-    twist = torch.zeros(1, 6, dtype=torch.float64)
+    twist = zeros(1, 6)
     twist[0, :3] = float(np.radians(degrees)) * R[:, 1]
     return apply_twist(TRUTH, twist, CENTRE)
 
@@ -71,7 +71,7 @@ def fit(renderer, image, starts):
 def test_matches_of_a_fitted_pose_lie_within_twelve_pixels(renderer, aside, is_found):
     given = problem_of(renderer, image(), [])
     problem = given[2]
-    shift = torch.zeros(1, 6, dtype=torch.float64)
+    shift = zeros(1, 6)
     shift[0, 3] = aside * TRUTH[0, 2, 3] / problem.K[0, 0, 0]
     matches = texture_matches(*given, apply_twist(TRUTH, shift, CENTRE))
     right = matches is not None and matches.inlier_ratio(TRUTH, problem.K) > CONVINCING_RATIO
@@ -177,7 +177,7 @@ def test_label_does_not_pull_a_pose_out_of_its_limits(monkeypatch):
     views = cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y")
     registrar = exact_registrar(bank_of(MESH, views))
     prior = cr.PosePrior(rotation=turned_can(16.0)[0, :3, :3], within=6.0)
-    free, limited = (registrar([image()], BOX[None], CAMERA, prior=p)[0] for p in (None, prior))
+    free, limited = (answer_of(registrar, image(), BOX, prior=p) for p in (None, prior))
     assert rotation_error(free.rotation, R) < 1.0
     assert prior.excess(limited.rotation) <= 3.0
     assert limited.hypotheses[0].covariance is not None, "its contours are fitted"

@@ -20,7 +20,7 @@ from curvireg_torch.registration.camera import focal_contradiction, stretch_cont
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.photograph import as_photograph
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support import double, learned_registrar, seeded, seen_from
+from tests._support import answer_of, double, learned_registrar, seeded, seen_from
 from tests._support.spies import spied
 
 SIZE = (360, 480)
@@ -44,7 +44,7 @@ def registered(factor):
     image, box = near_photograph()
     with pytest.MonkeyPatch.context() as patch:
         given = spied(patch, camera_module, "camera_gaps")
-        return learned_registrar()([image], box[None], camera(factor))[0], given[0]
+        return answer_of(learned_registrar(), image, box, camera(factor)), given[0]
 
 
 def together(*factors):
@@ -98,7 +98,7 @@ def stretched(wide, high, *, with_camera=True):
     picture = resize(image, (H, W), interpolation="bilinear", align_corners=False)
     box = box * torch.tensor([wide, high, wide, high])
     K = camera_matrix(FOCAL, FOCAL, 0.5 * (W - 1), 0.5 * (H - 1), dtype=torch.float64)
-    return learned_registrar()([picture], box[None], K if with_camera else None)[0]
+    return answer_of(learned_registrar(), picture, box, K if with_camera else None)
 
 
 @pytest.mark.parametrize(

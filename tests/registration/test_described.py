@@ -11,7 +11,7 @@ from curvireg_torch.geometry.framing import CropFrame, photograph_box
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration.block import Described, counting_keypoints, evidence_of
-from tests._support import CAMERA, SIZE, double, eye, learned_registrar, scene
+from tests._support import CAMERA, SIZE, double, eye, learned_registrar, scene, zeros
 from tests._support.hypotheses import HALF_TURN, placed_at
 
 
@@ -40,7 +40,7 @@ def described(target, T, *frames):
 def test_keypoints_that_agree_by_chance_do_not_count(chance, expected):
     counts = double([0.0, 2.0, 3.0, 22.0])
     pipeline = Pipeline(fit=FitSettings(chance_keypoints=chance))
-    poses = placed_at(eye(4).repeat(4, 1, 1), torch.zeros(3).double(), eye(3))
+    poses = placed_at(eye(4).repeat(4, 1, 1), zeros(3), eye(3))
     described = SimpleNamespace(keypoints=[SimpleNamespace(agreeing=lambda *_: counts), None])
     target = SimpleNamespace(pipeline=pipeline)
     assert counting_keypoints(target, described, poses).tolist() == expected

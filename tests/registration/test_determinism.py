@@ -6,12 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from curvireg_torch import Pipeline, Registrar, rotation_error
+from curvireg_torch import Pipeline, Registrar
 from curvireg_torch.synthetic import example_mesh
 from tests._support import (
     CAMERA,
     answer_to,
     bank_around,
+    check_agreement,
     first_scenes,
     seeded,
     skip_unless_products_are_exact,
@@ -27,13 +28,6 @@ def bank():
     detection = replace(pipeline.detection, views=12, proposals=4)
     pipeline = replace(pipeline, hypotheses=2, detection=detection)
     return bank_around(example_mesh(), 30, [0, 30, 60], pipeline=pipeline, image_size=64)
-
-
-def check_agreement(one, other):
-    """To .05 degrees, and .01 of confidence."""
-    assert rotation_error(one.rotation, other.rotation) < 0.05
-    assert other.confidence == pytest.approx(one.confidence, abs=0.01)
-    assert other.verdict == one.verdict
 
 
 def test_runs_of_the_same_call_are_bit_identical(bank):

@@ -16,12 +16,14 @@ from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photo
 from tests._support import (
     CAMERA,
     SIZE,
+    answer_of,
     degrees_off,
     double,
     learned_registrar,
     scene,
     seeded,
     truck_registrar,
+    zeros,
 )
 from tests._support.hypotheses import placed_at
 from tests.fitting.test_camera_fit import NEAR, near_scene
@@ -29,7 +31,7 @@ from tests.fitting.test_camera_fit import NEAR, near_scene
 
 def test_an_unknown_camera_is_estimated():
     image, box, T = near_scene()
-    result = learned_registrar()([image], box[None])[0]
+    result = answer_of(learned_registrar(), image, box, None)
     assert result.camera.source == "estimated"
     assert torch.equal(result.camera.matrix, result.projection[1])
     ratio = float(result.camera.matrix[0, 0] / NEAR[0, 0])
@@ -38,7 +40,7 @@ def test_an_unknown_camera_is_estimated():
     # the distance is proportional to the focal length
     position = result.transform[:3, 3] / ratio - T[:3, 3]
     assert position.norm() < 0.1 * float(T[:3, 3].norm())
-    given = learned_registrar()([image], box[None], NEAR)[0]
+    given = answer_of(learned_registrar(), image, box, NEAR)
     assert (given.camera.source, given.camera.focal_deviation) == ("given", 0.0)
     deviation = float(result.standard_deviations[1][2])
     assert deviation > given.standard_deviations[1][2]
@@ -63,7 +65,7 @@ def test_focal_lengths_with_small_deviations_are_right():
         near = double([0.0, 0.0, 2.5 * describer.radius])
         T[:3, 3] = near - T[:3, :3] @ describer.centre
         image, box = synthesize_photograph(mesh, T, K, size, generator)
-        result = learned_registrar()([image], box[None])[0]
+        result = answer_of(learned_registrar(), image, box, None)
         assert degrees_off(result, T) < 3.0
         error = abs(float((result.camera.matrix[0, 0] / K[0, 0]).log()))
         ratios.append(error / result.camera.focal_deviation)
@@ -109,7 +111,7 @@ def test_an_unknown_principal_point_moves_the_object_with_its_ray_and_keeps_its_
     position = point_in_cameras(T, centre)
     covariance = camera_module.principal_covariance(placed_at(T, centre), SIZE, centre)[0]
     pixels = camera_module.PRINCIPAL_DEVIATION * 240
-    moved_by = torch.zeros(6, 6, dtype=torch.float64)
+    moved_by = zeros(6, 6)
     for axis in range(2):
         step = 1e-4
         camera = CAMERA.clone()

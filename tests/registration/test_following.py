@@ -22,8 +22,9 @@ from curvireg_torch.synthetic import example_mesh, procedural_background, synthe
 from tests._support import (
     CAMERA,
     SIZE,
+    check_near,
+    degrees_off,
     double,
-    errors,
     learned_registrar,
     refused,
     seeded,
@@ -40,9 +41,7 @@ LOST = Mock(side_effect=LostObjectError("lost"))
 
 
 def check_pose(result, T, degrees=4.0, share=0.04):
-    found = errors(result, T)
-    assert found[0] < degrees
-    assert found[1] < share
+    check_near(result.transform, T, degrees, share)
 
 
 def follower(registrar=None):
@@ -208,7 +207,7 @@ def test_a_wrong_start_never_becomes_believed(with_box):
     follow._base = 0.45  # doubtful
     image, box, T = frames[1]
     result = follow(image, box if with_box else None)
-    assert not result.ok or errors(result, T)[0] < 5.0 or result.confidence < BELIEVED_CONFIDENCE
+    assert not result.ok or degrees_off(result, T) < 5.0 or result.confidence < BELIEVED_CONFIDENCE
 
 
 def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
@@ -223,7 +222,7 @@ def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
         assert follow(frames[2][0]).confidence <= 0.3
     confirmed = follow(frames[3][0])
     assert confirmed.confidence > BELIEVED_CONFIDENCE
-    assert errors(confirmed, frames[3][2])[0] < 4.0
+    assert degrees_off(confirmed, frames[3][2]) < 4.0
     monkeypatch.setattr(tracking, "refine_one", LOST)
     assert follow(frames[4][0]).confidence > BELIEVED_CONFIDENCE, "tracked from the confirmed pose"
 
@@ -237,7 +236,7 @@ def test_follower_refines_where_tracking_is_doubtful(monkeypatch):
     there = synthesize_photograph(example_mesh(), jumped, CAMERA, SIZE, seeded(9))[0]
     monkeypatch.setattr(tracking, "TRUSTED_CONFIDENCE", 1.1)  # whatever the tracker says
     calls = spied(monkeypatch, tracking, "refine_one")
-    assert errors(follower()(there), jumped)[0] < 4.0
+    assert degrees_off(follower()(there), jumped) < 4.0
     assert len(calls) == 1
 
 
@@ -386,7 +385,7 @@ def test_follower_loses_an_absent_object_and_finds_it_again():
     lost = follow(empty)
     assert not lost.ok or lost.confidence < BELIEVED_CONFIDENCE
     result = follow(frames[1][0])
-    assert errors(result, frames[1][2])[0] < 4.0
+    assert degrees_off(result, frames[1][2]) < 4.0
 
 
 @pytest.mark.parametrize("confidence", [math.nan, 1.5, -0.1, "sure"])
@@ -408,5 +407,5 @@ def test_frames_below_one_half_are_checked_and_a_start_of_no_confidence_is_kept(
         calls.clear()
         follow = Follower(learned_registrar(), CAMERA)
         follow.start(first, start, confidence=confidence)
-        assert errors(follow(second), T)[0] < 5.0
+        assert degrees_off(follow(second), T) < 5.0
         assert len(calls) == checks

@@ -18,7 +18,7 @@ from curvireg_torch.geometry.framing import (
 )
 from curvireg_torch.registration.judging import outside_warnings
 from curvireg_torch.registration.photograph import as_photograph
-from tests._support import answer_of, double, errors, eye, learned_registrar, scene, slow_after
+from tests._support import answer_of, degrees_off, double, eye, learned_registrar, scene, slow_after
 
 SQUARE = torch.from_numpy(trimesh.creation.box((1.0, 1.0, 0.001)).vertices.copy())
 K = camera_matrix(100.0, 100.0, 49.5, 39.5)
@@ -103,7 +103,7 @@ def test_half_of_an_object_at_the_border_gives_its_pose(seed):
     end = int(0.5 * (box[0] + box[2]))
     visible = torch.tensor([box[0], box[1], end - 0.5, box[3]])
     result = answer_of(learned_registrar(), image[..., :end], visible)
-    assert errors(result, T)[0] < 10.0
+    assert degrees_off(result, T) < 10.0
     features = result.confidence_features
     assert (features["border"], features["outside"]) == (1, pytest.approx(0.5, abs=0.15))
     assert any("outside the photograph" in text for text in result.warnings)

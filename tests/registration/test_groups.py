@@ -14,12 +14,11 @@ from curvireg_torch.registration.judging import Rivals, axis_of, directions_agre
 from curvireg_torch.registration.result import AXIS_TOLERANCE, Axis
 from curvireg_torch.visualization.contours import AXIS
 from curvireg_torch.visualization.overlay import contour_overlay, registration_sheet
-from tests._support import answer_of, bank_around, double, exact_registrar
+from tests._support import answer_of, bank_around, double, exact_registrar, photograph_of, zeros
 from tests._support.canisters import canister
 from tests._support.results import FEATURES, registration
-from tests.registration.test_ties import photograph
 
-UPRIGHT = RoundAxis(double([0.0, 0.0, 1.0]), torch.zeros(3).double(), False)
+UPRIGHT = RoundAxis(double([0.0, 0.0, 1.0]), zeros(3), False)
 
 
 def turned(*viewpoints):
@@ -37,7 +36,7 @@ def rivals_of(*viewpoints, scores):
 def of_canister():
     """Seen from where the turn is hard to tell."""
     registrar = exact_registrar(bank_around(canister(), 15, [0, 25, 50]))
-    image, box, T = photograph(canister(), 160.0, 40.0, 1)
+    image, box, T = photograph_of(canister(), 160.0, 40.0, 1)
     return registrar, answer_of(registrar, image, box), (image, box, T)
 
 

@@ -22,6 +22,7 @@ from curvireg_torch.registration.photograph import (
 from tests._support import (
     CAMERA,
     SIZE,
+    answer_of,
     first_scenes,
     learned_answer,
     learned_registrar,
@@ -98,7 +99,7 @@ def test_result_with_a_questionable_camera_is_never_reliable():
     known = learned_registrar()
     pipeline = replace(known.pipeline, fit=FitSettings(reliable=0.0))
     registrar = Registrar(known.bank, pipeline=pipeline)
-    bad = registrar([image], box[None], far)[0]
+    bad = answer_of(registrar, image, box, far)
     assert learned_answer().reliable
     assert learned_answer().warnings == ()
     assert not bad.reliable

@@ -5,13 +5,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import stages
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import judged
-from tests._support import CAMERA, SIZE, double, eye
+from tests._support import CAMERA, SIZE, double, eye, zeros
 from tests._support.hypotheses import (
     HALF_TURN,
     competing,
@@ -21,7 +22,7 @@ from tests._support.hypotheses import (
     turned,
 )
 
-HULL = 0.3 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+HULL = 0.6 * torch.from_numpy(trimesh.creation.box().vertices)
 BOX = torch.tensor([90.0, 60.0, 150.0, 120.0])
 
 
@@ -52,7 +53,7 @@ def judgement(
     target = target_of(
         pipeline=pipeline or Pipeline(),
         bank=SimpleNamespace(views=SimpleNamespace(rotations=turned(0.0, 90.0, 180.0).float())),
-        describer=SimpleNamespace(hull=HULL, centre=torch.zeros(3).double()),
+        describer=SimpleNamespace(hull=HULL, centre=zeros(3)),
         round_axis=None,
         mesh_warnings=("of the mesh",),
         mesh_notes=("note",),

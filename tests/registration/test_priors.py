@@ -22,6 +22,7 @@ from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.photograph import Photograph
 from tests._support import (
     CAMERA,
+    answer_of,
     double,
     eye,
     learned_answer,
@@ -125,7 +126,7 @@ def test_no_hypothesis_exceeds_combined_limits_by_more_than_the_fit_may(seed):
     K = camera_matrix(90.0, 90.0, 200.0, 150.0)
     prior = PosePrior(azimuth=(20.0, 40.0), elevation=(20.0, 40.0), theta=(-40.0, 40.0))
     for registrar, tolerance in ((truck_registrar(contours=False), 0.01), (truck_registrar(), 3.0)):
-        for hypothesis in registrar([image], box[None], K, prior=prior)[0].hypotheses:
+        for hypothesis in answer_of(registrar, image, box, K, prior=prior).hypotheses:
             assert prior.excess(hypothesis.rotation) <= tolerance
 
 

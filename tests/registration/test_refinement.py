@@ -11,20 +11,20 @@ import curvireg_torch as cr
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.registration import refinement
-from curvireg_torch.synthetic import procedural_background, synthesize_photograph
+from curvireg_torch.synthetic import procedural_background
 from tests._support import (
     CAMERA,
-    SIZE,
     answer_of,
     bank_around,
+    check_near,
+    degrees_off,
     double,
-    errors,
     exact_registrar,
     learned_registrar,
+    photograph_of,
     refused,
     scene,
     seeded,
-    seen_from,
     slow_after,
     truck_registrar,
 )
@@ -54,16 +54,14 @@ CHANGES = [
 def test_refine_ends_at_the_truth(seed, change):
     image, _, T = scene(seed)
     result = truck_registrar().refine([image], CAMERA, [moved(T, **change)])[0]
-    rotation, position = errors(result, T)
-    assert rotation < 2.0
-    assert position < 0.02
+    check_near(result.transform, T, degrees=2.0, share=0.02)
 
 
 def test_refine_reports_the_best_of_several_starts():
     image, _, T = scene(0)
     starts = torch.stack([moved(T, degrees=170.0, axis=(0.0, 1.0, 0.0)), moved(T, degrees=5.0)])
     result = truck_registrar().refine([image], CAMERA, [starts])[0]
-    assert errors(result, T)[0] < 2.0
+    assert degrees_off(result, T) < 2.0
     assert result.edge_support == max(h.edge_support for h in result.hypotheses)
     assert rotation_error(result.hypotheses[-1].rotation, T[:3, :3]) > 90.0
 
@@ -140,7 +138,7 @@ def test_a_half_turn_does_not_become_believed_by_being_refined(seed):
     registrar = learned_registrar()
     image, box, T = scene(seed)
     right, wrong = registrar.refine([image] * 2, CAMERA, [moved(T, degrees=3.0), T @ HALF_TURN])
-    assert errors(right, T)[0] < 2.0
+    assert degrees_off(right, T) < 2.0
     assert not wrong.ok or wrong.confidence < min(0.5, right.confidence)
     assert right.confidence <= answer_of(registrar, image, box).confidence + 0.05
 
@@ -150,8 +148,7 @@ def test_poses_that_look_alike_are_confirmed_by_the_same_registration(number):
     """A cuboid, from its true pose and from that which a half turn makes of it."""
     mesh = trimesh.creation.box((0.2, 0.3, 0.15))
     registrar = exact_registrar(bank_around(mesh, 30, [0, 30, 60]))
-    T = seen_from(mesh, 30.0, 30.0, radii=6.1)
-    image, _ = synthesize_photograph(mesh, T, CAMERA, SIZE, seeded(0))
+    image, _, T = photograph_of(mesh, 30.0, 30.0, 0, radii=6.1)
     symmetries = registrar.symmetries_of(exact=True).double()
     true, turned = registrar.refine([image] * 2, CAMERA, [T, T @ symmetries[number]])
     assert turned.confidence == pytest.approx(true.confidence, abs=0.02)

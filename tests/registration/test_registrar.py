@@ -35,7 +35,7 @@ from curvireg_torch.registration import (
 from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration.photograph import Photograph, as_photograph, check_crop
 from curvireg_torch.rendering import make_renderer, render_depth
-from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from curvireg_torch.synthetic import example_mesh
 from tests._support import (
     CAMERA,
     SIZE,
@@ -49,10 +49,9 @@ from tests._support import (
     first_scenes,
     learned_answer,
     learned_registrar,
+    photograph_of,
     refused,
     scene,
-    seeded,
-    seen_from,
     truck_answer,
     truck_bank,
     truck_registrar,
@@ -194,7 +193,7 @@ def test_registrar_accepts_tensors_arrays_and_paths_and_rejects_bad_calls(tmp_pa
     for scores in others:
         torch.testing.assert_close(scores, first, atol=1e-5, rtol=1e-4)
     with refused("focal"):
-        _ = registrar([IMAGE], BOX[None], torch.diag(double([0.0, 1, 1])))[0].rotation
+        _ = answer_of(registrar, IMAGE, BOX, torch.diag(double([0.0, 1, 1]))).rotation
     for images, boxes, camera, message in (
         ([IMAGE], BOX[None], CAMERA.expand(2, 3, 3), r"expected \(3, 3\) or \(1, 3, 3\)"),
         ([IMAGE], BOX.expand(3, 4), None, r"shape \(1, 4\), one for each image, got \(3, 4\)"),
@@ -217,7 +216,7 @@ def test_registrar_uses_and_records_a_custom_field():
     registrar = Registrar(truck_bank(), field=ImageGradient(), pipeline=unrefined(truck_bank()))
     assert registrar.pipeline.field == "custom:ImageGradient"
     gradient = ViewMatcher(truck_bank(), field=ImageGradient())([IMAGE], BOX[None])
-    assert registrar([IMAGE], BOX[None])[0].ranking.scores.equal(gradient.scores)
+    assert answer_of(registrar, IMAGE, BOX, None).ranking.scores.equal(gradient.scores)
 
 
 def test_covariance_needs_a_reliable_result_and_a_camera():
@@ -232,7 +231,7 @@ def test_covariance_needs_a_reliable_result_and_a_camera():
     unknown = replace(result, hypotheses=(replace(result.hypotheses[0], covariance=None),))
     assert not unknown.reliable, "a fitted pose without a covariance"
     similar = Registrar(known.bank, mesh_is="similar")
-    assert similar([IMAGE], BOX[None])[0].covariance is None
+    assert answer_of(similar, IMAGE, BOX, None).covariance is None
 
 
 def test_progress_reports_stages_and_may_cancel(monkeypatch):
@@ -402,13 +401,9 @@ def half_way():
     """A coarse bank, and photographs and boxes of poses half-way between two of its views, both of
     which lead there."""
     mesh = example_mesh()
-    shown = [
-        synthesize_photograph(
-            mesh, seen_from(mesh, azimuth, 20.0, radii=3.5), CAMERA, SIZE, seeded(1)
-        )
-        for azimuth in (15.0, 45.0, 75.0, 225.0)
-    ]
-    images, boxes = zip(*shown, strict=True)
+    azimuths = (15.0, 45.0, 75.0, 225.0)
+    shown = [photograph_of(mesh, azimuth, 20.0, 1, radii=3.5) for azimuth in azimuths]
+    images, boxes, _ = zip(*shown, strict=True)
     return bank_around(mesh, 30, [20], pipeline=PRESETS["classical"]), images, torch.stack(boxes)
 
 

@@ -13,7 +13,7 @@ from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import rig as rig_module
 from curvireg_torch.registration.rig import ELSEWHERE, Rig, RigPhotograph, RigProblem
-from tests._support import double, eye, refused
+from tests._support import double, eye, refused, zeros
 from tests._support.hypotheses import HALF_TURN, evidence_of
 
 LOST_CONFIDENCE = Pipeline().fit.lost_confidence
@@ -192,7 +192,7 @@ def test_gaps_are_towards_the_poses_that_photographs_alone_found():
     """10 degrees about z, and half a unit to the right: in standard deviations of half of each."""
     alone = torch.cat([turned(10.0), turned(0.0, shift=0.5), turned(0.0, 0.0)])
     one = problem(alone=alone, root=2.0 * eye(6).repeat(4, 1, 1))
-    expected = torch.zeros(4, 6, 1, dtype=torch.float64)
+    expected = zeros(4, 6, 1)
     expected[0, 2] = 2.0 * math.radians(10.0)
     expected[1, 3] = 1.0
     assert_close(one.gaps(turned(0.0).repeat(4, 1, 1)), expected)

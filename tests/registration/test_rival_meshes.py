@@ -18,13 +18,13 @@ from tests._support import (
     answer_of,
     bank_around,
     learned_registrar,
+    photograph_of,
     scene,
     slow_after,
     truck_answer,
     truck_bank,
 )
 from tests._support.results import registration
-from tests.registration.test_ties import photograph
 
 
 @cache
@@ -44,7 +44,7 @@ def bank(*, with_cabin=True, scale=1.0):
 
 
 def registered(shown, *banks):
-    image, box, _ = photograph(shown, 35.0, 25.0, 0)
+    image, box, _ = photograph_of(shown, 35.0, 25.0, 0)
     pipeline = learned_registrar().pipeline  # photographs are registered once
     return answer_of(Registrar(list(banks), pipeline=pipeline), image, box)
 

@@ -25,7 +25,7 @@ from curvireg_torch.mesh.mesh import principal_rotation
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.registration import block, hypotheses, stages
 from curvireg_torch.terms import Appearance
-from tests._support import answer_to, bank_of, double, eye, refused, scene, truck_bank
+from tests._support import answer_of, answer_to, bank_of, double, eye, refused, scene, truck_bank
 
 
 def test_coherent_views_are_connected_with_the_best_by_neighbours():
@@ -255,7 +255,7 @@ def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh
     in_frame = one.rotations.double() @ principal_rotation(mesh).T
     assert_close(in_frame, paper_views().rotations.double(), rtol=0, atol=1e-5)
     image, box, _ = scene(0)
-    first, second = (Registrar(bank)([image], box[None])[0] for bank in (one, other))
+    first, second = (answer_of(Registrar(bank), image, box, None) for bank in (one, other))
     # the allocentric one is what is searched for: the other follows from the centre of a box, which
     # does not turn with the mesh
     found = second.allocentric_rotation @ turn
@@ -267,7 +267,8 @@ def test_the_search_starts_from_allowed_views_and_ends_within_the_limits():
     right = float(viewpoint_from_rotation(T[:3, :3])[0])
     prior = PosePrior(azimuth=((right + 90.0) % 360.0, (right + 180.0) % 360.0))
     pipeline = replace(PRESETS["paper"], views=ViewPolicy(pose="upright"))
-    result = Registrar(truck_bank().mesh, pipeline=pipeline)([image], box[None], prior=prior)[0]
+    registrar = Registrar(truck_bank().mesh, pipeline=pipeline)
+    result = answer_of(registrar, image, box, None, prior=prior)
     away = (result.viewpoint[0] - right) % 360.0
     assert 90.0 - 1e-3 <= away <= 180.0 + 1e-3
 

@@ -23,6 +23,7 @@ from tests._support import (
     refused,
     seeded,
     seen_from,
+    zeros,
 )
 
 EASY = ((100.0, 1), (135.0, 2), (175.0, 3))
@@ -72,7 +73,7 @@ def beside():
     """A fourth photograph, its box, and a camera that looks the other way."""
     image, box, T = photograph(60.0, 4, 0.1)
     camera = T @ torch.linalg.inv(WORLD)
-    return image, box, camera, transform(HALF_TURN, torch.zeros(3).double()) @ first_of(1)[2]
+    return image, box, camera, transform(HALF_TURN, zeros(3)) @ first_of(1)[2]
 
 
 def check_pose(result, *, degrees=2.0, shift=0.1):

@@ -15,7 +15,7 @@ from curvireg_torch.registration import judging
 from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import Siblings
 from curvireg_torch.registration.target import TellingSymmetries
-from tests._support import double, eye
+from tests._support import double, eye, zeros
 from tests._support.hypotheses import competing, evidence_of, poses_at, target_of
 
 
@@ -72,12 +72,12 @@ class Case:
     def __init__(self, monkeypatch, measured):
         self.fitted: list[Hypotheses] = []
         angles = double([0.0, 1.0, 2.0])[:, None] * double([0.0, 0.0, 2.0 * math.pi / 3.0])
-        self.symmetries = transform(rotation_from_axis_angle(angles), torch.zeros(3, 3).double())
+        self.symmetries = transform(rotation_from_axis_angle(angles), zeros(3, 3))
         self.poses = four([0.0] * 3, [[0.0] * 3] * 3, [0, 40, 80]).poses
         different = ~torch.eye(3, dtype=torch.bool)
         monkeypatch.setattr(judging, "fitted_poses", self.fit)
         monkeypatch.setattr(judging, "by_contours", lambda *_: torch.arange(3))
-        monkeypatch.setattr(judging, "compared", lambda _: (torch.zeros(3, 3).double(), different))
+        monkeypatch.setattr(judging, "compared", lambda _: (zeros(3, 3), different))
         evidence = {3: evidence_of(*measured), 1: evidence_of(0.95)}
         monkeypatch.setattr(
             judging,
@@ -96,7 +96,7 @@ class Case:
         """``keeps``: what the limits say, one call after the other."""
         target = target_of(
             telling_symmetries=TellingSymmetries(self.symmetries),
-            describer=SimpleNamespace(device_contours=None, centre=torch.zeros(3).double()),
+            describer=SimpleNamespace(device_contours=None, centre=zeros(3)),
         )
         answers = iter(keeps or [])
         block = MagicMock()

@@ -8,6 +8,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch.errors import ImageError
 from curvireg_torch.fitting.contour_problem import ContourState
@@ -16,7 +17,7 @@ from curvireg_torch.fitting.regions import RegionModel
 from curvireg_torch.geometry.framing import boxes_at
 from curvireg_torch.registration import tracking
 from curvireg_torch.registration.tracking import Tracker
-from tests._support import double, eye
+from tests._support import double, eye, zeros
 from tests.fitting.cube import pose
 
 K = double([[200.0, 0, 99.5], [0, 200.0, 49.5], [0, 0, 1]])
@@ -27,7 +28,7 @@ def at(x=0.0, z=5.0):
     return pose([0.0, 0.0, 0.0], [x, 0.0, z])[None]
 
 
-HULL = 0.5 * double([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+HULL = torch.from_numpy(trimesh.creation.box().vertices)
 PLATE = HULL * torch.tensor([1.0, 1.0, 0.0])
 
 
@@ -89,7 +90,7 @@ def fitted(monkeypatch, keyframes, last, shift=100.0, *, stale=False):
         _angles=lambda _: angles[: len(keyframes)],
         _step=step,
         _tracked=tracked,
-        centre=torch.zeros(3).double(),
+        centre=zeros(3),
         hull=PLATE,
     )
     image = None
@@ -176,9 +177,7 @@ def test_the_prediction_that_convinces_ends_the_search_else_the_best_counts(foun
 def test_starting_again_forgets_what_was_seen(monkeypatch):
     """Of three accepted poses the last two predict the next one."""
     renderer = SimpleNamespace(render=lambda *_: torch.zeros(1))
-    contours = SimpleNamespace(
-        centre=torch.zeros(3).double(), radius=1.0, renderer=lambda _: renderer
-    )
+    contours = SimpleNamespace(centre=zeros(3), radius=1.0, renderer=lambda _: renderer)
     follow = Tracker(contours, HULL)
     monkeypatch.setattr(follow, "_learn", lambda *_: None)
     monkeypatch.setattr(follow, "_remember", lambda *_: follow._keyframes.append(None))
@@ -205,7 +204,7 @@ def test_a_turn_goes_on_about_the_axes_of_the_camera():
     """From A to B it is B A^T, and so B A^T B comes next."""
     before = pose([0.3, 0.0, 0.0], [0.0, 0.0, 5.0])[None]
     last = pose([0.0, 0.5, 0.0], [0.0, 0.0, 5.0])[None]
-    follow = SimpleNamespace(_poses=[before, last], last_pose=last, centre=torch.zeros(3).double())
+    follow = SimpleNamespace(_poses=[before, last], last_pose=last, centre=zeros(3))
     predicted, _ = Tracker.predictions(follow)
     A = before[0, :3, :3]
     B = last[0, :3, :3]

@@ -13,7 +13,7 @@ from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import Camera
 from curvireg_torch.registration import camera as camera_module
 from curvireg_torch.registration.photograph import Photograph
-from tests._support import CAMERA, SIZE, double, refused
+from tests._support import CAMERA, SIZE, double, refused, zeros
 from tests._support.hypotheses import all_kept, competing, evidence_of, poses_at, target_of
 
 NOTHING = None
@@ -96,7 +96,7 @@ def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source
 
 def test_the_covariance_is_that_of_the_origin(monkeypatch):
     """With the motion of the centre and the rotation about it, of an origin beside the centre."""
-    pose = replace(poses_of(1), covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
+    pose = replace(poses_of(1), covariance=zeros(1, 6, 6))
     motion = double([[0.02, -0.03, 0.01, 0.3, -0.1, 0.5]])
     one = double([1.0])
     information = CameraInformation(amount=one, scale=0.04 * one, step=one)

@@ -21,8 +21,8 @@ from tests._support import (
     CAMERA,
     SIZE,
     answer_of,
+    degrees_off,
     double,
-    errors,
     eye,
     learned_registrar,
     scene,
@@ -87,13 +87,13 @@ def test_what_lies_beside_a_visible_box_does_not_count():
 def test_a_hidden_half_needs_a_box_that_is_said_to_be_visible(seed):
     image, box, T = half_hidden(seed)
     result = answer_of(visible_registrar(), image, box)
-    assert errors(result, T)[0] < 10.0
+    assert degrees_off(result, T) < 10.0
     item = as_photograph(image, box, CAMERA)
     assert _in_box_of_pose(visible_registrar(box_jitter=0.1), [item], result, 0, 0.85) is None
     whole = cr.Registrar(learned_registrar().bank)
     assert _in_box_of_pose(whole, [item], result, 0, 0.85) is not None
     as_whole = answer_of(learned_registrar(), image, box)
-    assert errors(as_whole, T)[0] > 15.0
+    assert degrees_off(as_whole, T) > 15.0
     assert not as_whole.reliable
 
 

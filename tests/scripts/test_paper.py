@@ -51,18 +51,21 @@ def root(tmp_path_factory):
     return root
 
 
+def records_of(phase, root):
+    return reproduce_paper.measure(phase, SETTINGS, "upright", find_cases("web", root))
+
+
 @pytest.fixture(scope="module")
 def views(root):
     """Records of rankings, of a tenth of the views."""
     with pytest.MonkeyPatch.context() as patch:
         few = {"azimuth_step": 30.0, "elevations": (0.0, 30.0)}
         patch.setattr(measure, "ViewPolicy", lambda pose: ViewPolicy(pose, **few))
-        found = measure.measure_views(find_cases("web", root), SETTINGS, "upright")
-    return [{"category": "thing", "cad": "thing", **record} for record in found]
+        return records_of("views", root)
 
 
 def test_points_of_the_true_view_are_repeated_most(root):
-    records = measure.measure_points(find_cases("web", root), SETTINGS, "upright")
+    records = records_of("points", root)
     assert {name.upper() for name in DETECTORS} == set(records[0]["points"])
     for record in records:
         for name in ("MFC", "MCS", "IG"):
@@ -146,7 +149,7 @@ def test_chance_and_ceiling_stand_below_precision(views):
 
 
 def test_focus_curves_by_threshold_and_precision_by_protocol(root):
-    records = measure.measure_focus(find_cases("web", root), SETTINGS, "upright")
+    records = records_of("focus", root)
     assert set(records[0]["chance"]) == set(tables.PROTOCOLS.values())
     for record in records:
         # upright views: a half turn is as probable, and 20 draws more so
@@ -159,8 +162,7 @@ def test_focus_curves_by_threshold_and_precision_by_protocol(root):
         assert found["right"] == pytest.approx(0.0, abs=30.0)
         weak = [record[f"MFC {t:.4f}"]["ip"] for t in measure.THRESHOLDS]
         assert weak[0] < max(weak)
-    named = [{"category": "thing", "cad": "thing", **record} for record in records]
-    thresholds, protocols = tables.focus_tables(tables.Records(named, "two photographs"))
+    thresholds, protocols = tables.focus_tables(tables.Records(records, "two photographs"))
     assert [row[0] for row in thresholds.rows[:2]] == ["0.0010", "0.0067"]
     assert [row[0] for row in protocols.rows] == list(tables.PROTOCOLS)
 
@@ -245,26 +247,16 @@ def test_classes_stand_beside_the_papers():
     assert "literal / corrected, S_hog as printed / corrected / the paper" in table.definition
 
 
-def run(monkeypatch, *words):
-    monkeypatch.setattr(sys, "argv", ["reproduce_paper.py", *map(str, words)])
-    run_script(reproduce_paper.main)
+def run(monkeypatch, script, *words):
+    monkeypatch.setattr(sys, "argv", [script.__name__, *map(str, words)])
+    run_script(script.main)
 
 
 def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     page = tmp_path / "paper.md"
     page.write_text("# Page\n\n<!-- paper:begin -->\n<!-- paper:end -->\n")
-    words = [
-        "repeatability",
-        "web",
-        root,
-        "--out",
-        tmp_path,
-        "--image-size",
-        "64",
-        "--page",
-        page,
-    ]
-    run(monkeypatch, *words)
+    words = ["web", root, "--out", tmp_path, "--image-size", "64", "--page", page]
+    run(monkeypatch, reproduce_paper, "repeatability", *words)
     text = (tmp_path / "repeatability.md").read_text()
     assert "N = 2 (1 CADs)" in text
     assert text in page.read_text()
@@ -274,13 +266,13 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     monkeypatch.setattr(
         reproduce_paper, "measure", Mock(side_effect=AssertionError("measured again"))
     )
-    run(monkeypatch, *words)
-    run(monkeypatch, "curve", *words[1:])
+    run(monkeypatch, reproduce_paper, "repeatability", *words)
+    run(monkeypatch, reproduce_paper, "curve", *words)
     assert (tmp_path / reproduce_paper.CURVE).stat().st_size > 1000
     assert "(images/paper-curve.webp)" in page.read_text()
     assert (tmp_path / "images" / "paper-curve.webp").stat().st_size > 1000
     with pytest.raises(AssertionError, match="measured again"):
-        run(monkeypatch, "precision", *words[1:])
+        run(monkeypatch, reproduce_paper, "precision", *words)
 
 
 @pytest.mark.parametrize(
@@ -290,7 +282,7 @@ def test_a_missing_package_is_named(root, tmp_path, monkeypatch, capsys, module,
     find_spec = util.find_spec
     monkeypatch.setattr(util, "find_spec", lambda name: None if name == module else find_spec(name))
     with pytest.raises(SystemExit, match="2"):
-        run(monkeypatch, "curve", "web", root, "--out", tmp_path)
+        run(monkeypatch, reproduce_paper, "curve", "web", root, "--out", tmp_path)
     assert (
         f"{package} is not installed; pip install 'curvireg_torch[paper]'"
         in capsys.readouterr().err
@@ -331,14 +323,9 @@ def test_the_staircase_shows_intervals_of_three_cads_and_what_is_known():
     assert "| 14. contour fit of five hypotheses: the default | - |" in text
 
 
-def climb(monkeypatch, out, *words):
-    monkeypatch.setattr(sys, "argv", ["staircase.py", *map(str, words), "--out", str(out)])
-    run_script(staircase.main)
-
-
 def test_steps_are_evaluated_once(pascal, tmp_path, monkeypatch, capsys):
-    words = [f"mini={pascal.root}", "--steps", "0"]
-    climb(monkeypatch, tmp_path, *words)
+    words = [f"mini={pascal.root}", "--steps", "0", "--out", tmp_path]
+    run(monkeypatch, staircase, *words)
     output = capsys.readouterr()
     assert "unreadable_image" in output.err
     summary = read_json(tmp_path / "mini" / "0" / "summary.json")
@@ -351,10 +338,10 @@ def test_steps_are_evaluated_once(pascal, tmp_path, monkeypatch, capsys):
     fail = Mock(side_effect=AssertionError("registered again"))
     with monkeypatch.context() as patch:
         patch.setattr("curvireg_torch.evaluation.datasets.cached_bank", fail)
-        climb(monkeypatch, tmp_path, *words)
+        run(monkeypatch, staircase, *words)
     assert line in capsys.readouterr().out
     with pytest.raises(SystemExit, match="2"):
-        climb(monkeypatch, tmp_path, "nothing")
+        run(monkeypatch, staircase, "nothing", "--out", tmp_path)
 
 
 def test_objects_without_a_pose_count_as_wrong(pascal, tmp_path, monkeypatch, capsys):
@@ -367,7 +354,7 @@ def test_objects_without_a_pose_count_as_wrong(pascal, tmp_path, monkeypatch, ca
     found = SimpleNamespace(errors=dict(zip(keys, errors, strict=False)))
     monkeypatch.setattr(staircase, "evaluate", lambda *_, **__: {"skipped": {}})
     monkeypatch.setattr(staircase, "read_run", lambda _: found)
-    climb(monkeypatch, tmp_path, f"mini={pascal.root}", "--steps", "3")
+    run(monkeypatch, staircase, f"mini={pascal.root}", "--steps", "3", "--out", tmp_path)
     text = capsys.readouterr().out
     assert "`mini`, N 2" in text
     assert "| 0.50, 104° |" in text
