@@ -137,7 +137,7 @@ class MeshSource:
         self._bytes_left = MAX_MESH_BYTES
         self._pixels_left = MAX_TEXTURE_PIXELS
         self._textures: dict[object, Bytes | None] = {}
-        self._names: set[str] = set()
+        self._known_places: dict[str, list[Path]] = {}
 
     def data(self) -> bytes:
         """The content of the mesh file."""
@@ -177,13 +177,16 @@ class MeshSource:
         _check_names(self.requested)
         return found
 
-    @remembered
     def _places(self, name: str) -> list[Path]:
-        """Where in the folders a file of a name may be, existing or not; of names of strangers a
-        bounded number is looked for. Backslashes separate folders too, and of absolute names the
-        last part counts."""
-        self._names.add(name)
-        _check_names(self._names)
+        """Where in the folders a file of a name may be, existing or not; each name is looked for
+        once, and of names of strangers a bounded number."""
+        if name not in self._known_places:
+            self._known_places[name] = self._places_of(name)
+            _check_names(self._known_places)
+        return self._known_places[name]
+
+    def _places_of(self, name: str) -> list[Path]:
+        """Backslashes separate folders too, and of absolute names the last part counts."""
         if "://" in name or not is_file_name(name):
             return []
         relative = name.replace("\\", "/")
