@@ -13,7 +13,6 @@ from ..errors import CurviregError, CurviregWarning, InvalidInputError, MissingF
 from ..geometry import symmetry_transforms
 from ..utils.aliases import Fields
 from ..utils.checks import check_symmetries
-from ..utils.computed import remembered
 from ..utils.files import finite_numbers, read_json
 
 README = "datasets/bop/README.md"
@@ -39,6 +38,7 @@ class BOPModels:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.files = model_files(folder)
+        self._hulls: dict[int, Tensor | None] = {}
         table = folder / "models_info.json"
         if table.is_file():
             self.info = read_models_info(table)
@@ -52,10 +52,14 @@ class BOPModels:
                 subject=folder,
             )
 
-    @remembered
     def hull(self, number: int) -> Tensor | None:
         """(V, 3) float64 vertices of a model's convex hull, in the file's unit; None if it cannot
         be read."""
+        if number not in self._hulls:
+            self._hulls[number] = self._read_hull(number)
+        return self._hulls[number]
+
+    def _read_hull(self, number: int) -> Tensor | None:
         from ..mesh import load_mesh
 
         with warnings.catch_warnings():

@@ -1,39 +1,8 @@
-"""What objects compute once, and objects without it."""
+"""Objects without what follows from the rest of them."""
 
-from collections.abc import Callable
-from functools import cached_property, wraps
-from typing import Any, TypeVar, TypeVarTuple
+from functools import cached_property
 
 from .aliases import Fields
-
-Given = TypeVarTuple("Given")
-Value = TypeVar("Value")
-
-
-def remembered(method: Callable[[Any, *Given], Value]) -> Callable[[Any, *Given], Value]:
-    """Decorate a method of hashable arguments: its object keeps the value for each of them.
-
-    Example:
-        >>> class Squares:
-        ...     @remembered
-        ...     def of(self, number):
-        ...         print("computed")
-        ...         return number**2
-        >>> squares = Squares()
-        >>> squares.of(3), squares.of(3)
-        computed
-        (9, 9)
-    """
-    name = f"values of {method.__name__}"
-
-    @wraps(method)
-    def value_of(self: Any, *given: *Given) -> Value:
-        known: dict[tuple[*Given], Value] = vars(self).setdefault(name, {})
-        if given not in known:
-            known[given] = method(self, *given)
-        return known[given]
-
-    return value_of
 
 
 def without_computed(thing: object) -> Fields:

@@ -11,7 +11,6 @@ from typing import Any
 from ...errors import MAX_CAMERA_BYTES, InvalidInputError, MissingFileError
 from ...utils.aliases import Document, Fields, PathName
 from ...utils.choices import listed
-from ...utils.computed import remembered
 from ...utils.files import split_name, without_zeros
 from ..documents import EXPECTED, read_document
 from .kinds import FORMATS, Format
@@ -72,6 +71,9 @@ def read_camera(path: PathName) -> CameraRecord:
 class CameraFiles:
     """Calibration files, each of which is read once, however many of its cameras are asked for."""
 
+    def __init__(self) -> None:
+        self._files: dict[Path, _Cameras] = {}
+
     def read(self, path: PathName) -> CameraRecord:
         """:func:`read_camera`."""
         file, name = split_name(path)
@@ -79,20 +81,22 @@ class CameraFiles:
             message = "no such file; check the path of the calibration"
             raise MissingFileError(message, subject=path, kind="calibration")
         try:
-            return self._cameras(file).camera(name)
+            if file not in self._files:
+                self._files[file] = _Cameras(_document(file))
+            return self._files[file].camera(name)
         except RecursionError:
             raise InvalidInputError("nested too deeply; write it again", subject=path) from None
         except InvalidInputError as error:
             kind = error.kind or "calibration"
             raise InvalidInputError(str(error), subject=path, kind=kind) from error
 
-    @remembered
-    def _cameras(self, file: Path) -> "_Cameras":
-        if file.stat().st_size > MAX_CAMERA_BYTES:
-            raise InvalidInputError(
-                f"larger than {MAX_CAMERA_BYTES:,} bytes; leave images and points out"
-            )
-        return _Cameras(_with_stereo_pair(_with_nested_cameras(read_document(file))))
+
+def _document(file: Path) -> Any:
+    if file.stat().st_size > MAX_CAMERA_BYTES:
+        raise InvalidInputError(
+            f"larger than {MAX_CAMERA_BYTES:,} bytes; leave images and points out"
+        )
+    return _with_stereo_pair(_with_nested_cameras(read_document(file)))
 
 
 @dataclass(frozen=True, eq=False)

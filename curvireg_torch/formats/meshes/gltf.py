@@ -21,7 +21,6 @@ from trimesh.transformations import quaternion_matrix
 from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TABLE_BYTES
 from ...utils.aliases import Fields
 from ...utils.arrays import Array, Bytes, Floats, Integers
-from ...utils.computed import remembered
 from ...utils.srgb import srgb
 from .colours import SurfaceColours, byte_colours
 from .limits import check_corners, check_faces, check_parts
@@ -174,6 +173,8 @@ class _File:
         self._binary = binary
         self._source = source
         self._buffers: dict[int, bytes] = {}
+        self._parts: dict[int, list[tuple[Fields, ReadMesh]]] = {}
+        self._skins: dict[int, Floats] = {}
         self._hidden: set[int] = set()
         self._places = dict(self._nodes())
 
@@ -217,15 +218,16 @@ class _File:
                 moved[block] += weights[block, k, None] * (turned + at[:, :3, 3])
         return moved
 
-    @remembered
     def _joints(self, index: int) -> Floats:
         """(J, 4, 4) what the joints of a skin do to a vertex that they alone move."""
-        skin = self._tree["skins"][index]
-        T = np.stack([self._places.get(joint, np.eye(4)) for joint in skin["joints"]])
-        if "inverseBindMatrices" in skin:
-            inverse = self._accessor(skin["inverseBindMatrices"])
-            T = T @ inverse.reshape(-1, 4, 4).transpose(0, 2, 1)[: len(T)]
-        return T
+        if index not in self._skins:
+            skin = self._tree["skins"][index]
+            T = np.stack([self._places.get(joint, np.eye(4)) for joint in skin["joints"]])
+            if "inverseBindMatrices" in skin:
+                inverse = self._accessor(skin["inverseBindMatrices"])
+                T = T @ inverse.reshape(-1, 4, 4).transpose(0, 2, 1)[: len(T)]
+            self._skins[index] = T
+        return self._skins[index]
 
     def _nodes(self) -> Iterator[tuple[int, Floats]]:
         """The nodes of the scene and their places in it."""
@@ -248,14 +250,16 @@ class _File:
                 "skin", "its morph targets are left out: the shape is that without them"
             )
 
-    @remembered
     def _mesh(self, index: int) -> list[tuple[Fields, ReadMesh]]:
-        return [
-            (part, self._part(part))
-            for part in self._tree["meshes"][index]["primitives"]
-            if part.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
-            and "POSITION" in part["attributes"]
-        ]
+        if index not in self._parts:
+            mesh = self._tree["meshes"][index]
+            self._parts[index] = [
+                (part, self._part(part))
+                for part in mesh["primitives"]
+                if part.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
+                and "POSITION" in part["attributes"]
+            ]
+        return self._parts[index]
 
     def _part(self, part: Fields) -> ReadMesh:
         vertices = self._accessor(part["attributes"]["POSITION"])

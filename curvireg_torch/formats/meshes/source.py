@@ -13,7 +13,6 @@ import numpy as np
 from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TEXTURE_PIXELS
 from ...utils.arrays import Bytes, Floats, Integers
 from ...utils.choices import unit_of_length
-from ...utils.computed import remembered
 from .colours import SurfaceColours, texture_pixels
 from .limits import check_corners
 
@@ -138,6 +137,7 @@ class MeshSource:
         self._pixels_left = MAX_TEXTURE_PIXELS
         self._textures: dict[object, Bytes | None] = {}
         self._known_places: dict[str, list[Path]] = {}
+        self._listings: dict[Path, dict[str, str]] = {}
 
     def data(self) -> bytes:
         """The content of the mesh file."""
@@ -278,11 +278,12 @@ class MeshSource:
         is_inside = any(place.is_relative_to(folder) for folder in roots)
         return place if is_inside and place.is_file() else None
 
-    @remembered
     def _names_in(self, folder: Path) -> dict[str, str]:
         """Names of a folder by their lower case; of several the first in order."""
-        names = sorted((path.name for path in folder.glob("*")), reverse=True)
-        return {name.lower(): name for name in names}
+        if folder not in self._listings:
+            names = sorted((path.name for path in folder.glob("*")), reverse=True)
+            self._listings[folder] = {name.lower(): name for name in names}
+        return self._listings[folder]
 
 
 def _check_names(names: Sized) -> None:

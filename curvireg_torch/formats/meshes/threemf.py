@@ -17,7 +17,6 @@ import numpy as np
 
 from ...errors import MAX_MESH_BYTES, MAX_MESH_FACES, MAX_MESH_PARTS
 from ...utils.arrays import Bytes, Floats
-from ...utils.computed import remembered
 from ..xml_files import check_xml, read_xml
 from .colours import SurfaceColours
 from .limits import check_corners, check_faces, check_parts
@@ -122,6 +121,8 @@ class _Package:
         self._bytes_left = MAX_MESH_BYTES
         self._faces = 0
         self._parts = 0
+        self._models: dict[str, _Model] = {}
+        self._meshes: dict[tuple[str, str], ReadMesh] = {}
 
     def root(self) -> str:
         """The path of the model that the package starts with: the one that it names, else by its
@@ -138,13 +139,14 @@ class _Package:
         order = [(_MODEL not in name, name.count("/"), len(name), name) for name in models]
         return f"/{min(order)[-1]}"
 
-    @remembered
     def model(self, path: str) -> _Model:
         """One model part of the package."""
-        model = _parsed(self._content(path))
-        for kind in sorted(model.unread):
-            self._source.warn("parts", f"it has parts that are not read ({kind}): left out")
-        return model
+        if path not in self._models:
+            model = _parsed(self._content(path))
+            for kind in sorted(model.unread):
+                self._source.warn("parts", f"it has parts that are not read ({kind}): left out")
+            self._models[path] = model
+        return self._models[path]
 
     def items(self, root: str) -> list[Item]:
         """What of the build is the object itself: no supports, nothing that is not printed, and of
@@ -180,7 +182,7 @@ class _Package:
         check_parts(self._parts)
         found = []
         if one.triangles:
-            mesh = self._mesh(path, name)
+            mesh = self._mesh(path, name, one)
             self._faces += len(mesh.faces)
             check_faces(self._faces)
             found.append(mesh.transformed(place))
@@ -188,14 +190,13 @@ class _Package:
             found += self.parts(other or path, child, place @ _matrix(transform), depth + 1)
         return found
 
-    @remembered
-    def _mesh(self, path: str, name: str) -> ReadMesh:
-        model = self.model(path)
-        one = model.objects[name]
-        vertices = np.array(one.vertices, np.float64).reshape(-1, 3)
-        faces = np.array(one.triangles, np.int64).reshape(-1, 3)
-        mesh = ReadMesh(vertices, faces, self._colours(model, one))
-        return mesh.without_unused_vertices()
+    def _mesh(self, path: str, name: str, one: _Object) -> ReadMesh:
+        if (path, name) not in self._meshes:
+            vertices = np.array(one.vertices, np.float64).reshape(-1, 3)
+            faces = np.array(one.triangles, np.int64).reshape(-1, 3)
+            mesh = ReadMesh(vertices, faces, self._colours(self.model(path), one))
+            self._meshes[path, name] = mesh.without_unused_vertices()
+        return self._meshes[path, name]
 
     def _colours(self, model: _Model, one: _Object) -> SurfaceColours | None:
         rows_of: dict[str, list[tuple[int, ...]]] = {}

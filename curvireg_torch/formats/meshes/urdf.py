@@ -19,7 +19,6 @@ from ...errors import MAX_TABLE_BYTES, MeshError
 from ...utils.aliases import Fields
 from ...utils.arrays import Floats
 from ...utils.choices import UNITS
-from ...utils.computed import remembered
 from ..xml_files import read_xml
 from .colours import SurfaceColours, byte_colours
 from .limits import check_faces, check_parts
@@ -105,6 +104,7 @@ class _Parts:
         self._source = source
         self._read_part = read_part
         self._colours = colours
+        self._meshes: dict[str, ReadMesh | None] = {}
         self.missing: list[str] = []
         self._faces = 0
         self._visuals = 0
@@ -151,11 +151,13 @@ class _Parts:
         return None
 
     def _file(self, shape: Any) -> ReadMesh | None:
-        mesh = self._read(str(shape.get("filename", "")))
+        name = str(shape.get("filename", ""))
+        if name not in self._meshes:
+            self._meshes[name] = self._read(name)
+        mesh = self._meshes[name]
         scale = fixed_numbers(shape.get("scale", "1 1 1"), 3)
         return None if mesh is None else mesh.transformed(np.diag([*scale, 1.0]))
 
-    @remembered
     def _read(self, name: str) -> ReadMesh | None:
         """The mesh of a file in metres; None, with a warning, without the file."""
         path = self._find(name)
