@@ -25,7 +25,7 @@ class Whitening(nn.Module):
         check_finite(mean, "mean")
         check_finite(covariance, "covariance")
         covariance = covariance.double()
-        # of which only one half is read
+        # Cholesky reads one half only
         if (covariance - covariance.T).norm() > 1e-4 * covariance.norm():
             raise InvalidInputError("covariance: expected a symmetric matrix")
         factor, failed = torch.linalg.cholesky_ex(covariance)

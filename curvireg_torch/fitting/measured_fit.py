@@ -118,7 +118,8 @@ def ideal_covariance(
     contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> Tensor:
     """(N, 6, 6) covariance that :class:`ContourFit` would have of poses ``T`` (N, 4, 4) if an edge
-    lay at each contour point: what it leaves open, no photograph determines to first order."""
+    lay at each contour point. A motion that is open then, no photograph of the pose determines to
+    first order."""
     problem = ContourProblem.of(contours, crops, K, image_index)
     points = problem.state(T).points
     _, J = project(points.model, points.normals, T, problem.K, contours.centre)

@@ -123,8 +123,8 @@ LEAST_LOSS = 1.353
 def with_determined_turns(
     target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses
 ) -> Hypotheses:
-    """Poses whose covariance contains what finite turns determine, that of the best one in each
-    photograph.
+    """Poses, where the covariance of each photograph's best one contains what finite turns
+    determine.
 
     The contours of a flat bottle that is seen from its broad side hardly move where it turns a
     little about its axis: to first order nothing determines that turn. By 30 degrees they change
@@ -156,10 +156,13 @@ def _with_finite_turn(
     ideal = by_contours(ideal_covariance, target.describer, crops, best)[0, :3, :3]
     if not float(axis @ ideal @ axis) >= UNKNOWN_ROTATION**2:
         return None
-    twist = torch.zeros(3, 6, dtype=torch.float64)
-    twist[1:, :3] = math.radians(RIVAL_ANGLE) * torch.stack([axis, -axis])
-    copies = best[torch.zeros(3, dtype=torch.long)]
+    along = covariance[:, :3] @ axis
     centre = target.describer.centre
+    # the motion of the centre that belongs to the turn, which need not be about the centre
+    lever = best.T[0, :3, :3] @ centre
+    motion = torch.cat([axis, along[3:] / variances[2] + torch.linalg.cross(axis, lever)])
+    twist = math.radians(RIVAL_ANGLE) * torch.stack([0.0 * motion, motion, -motion])
+    copies = best[torch.zeros(3, dtype=torch.long)]
     turned = with_evidence(
         target, block, placed(copies, apply_twist(copies.T, twist, centre), centre)
     )
@@ -169,7 +172,6 @@ def _with_finite_turn(
         return None
     # as if the turn had been measured, so that the covariance with other motions stays consistent
     variance = math.radians(RIVAL_ANGLE) ** 2 / (2.0 * loss)
-    along = covariance[:, :3] @ axis
     removed: Tensor = (1.0 - variance / variances[2]) / variances[2] * torch.outer(along, along)
     return covariance - removed
 

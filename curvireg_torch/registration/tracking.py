@@ -192,7 +192,7 @@ class Tracker:
 
     @property
     def distance(self) -> float:
-        """Of the object's centre in the last frame."""
+        """Distance of the object's centre in the last frame."""
         return float(point_in_cameras(self.last_pose, self.centre).norm())
 
     def predictions(self) -> list[Tensor]:
@@ -327,8 +327,8 @@ KEPT_CONFIDENCE = 0.2
 # Frames since the last reliable pose after which a trusted one is checked again; then after twice
 # as many, and so on
 FIRST_CHECK = 8
-# Factor between the distance and that of the last check, from which a trusted pose is checked
-# again: instead, the lens may have zoomed
+# Ratio of the distance to that of the last check from which a trusted pose is checked again: a zoom
+# of the lens looks like a change of distance
 CHECKED_ZOOM = 1.15
 # Confidence of a registration from which its pose is followed
 BELIEVED_CONFIDENCE = 0.5
@@ -515,6 +515,7 @@ class Follower:
         )
         refined = self._refined(item, torch.cat(starts))
         least = max(KEPT_CONFIDENCE, 0.0 if found is None else _confidence(found))
+        least = min(least, self._reliable)
         if isinstance(refined, Registration) and _confidence(refined) >= least:
             # track on from it, if it lies within the frame
             with suppress(LostObjectError, ImageError):
@@ -525,8 +526,10 @@ class Follower:
             return refined
         if tracked and found and _confidence(found) >= KEPT_CONFIDENCE:
             self._tracker.accept(tracked)
-            self._base = _confidence(found)
-            return replace(found, warnings=_each_once(found.warnings + self._warnings))
+            # the check has not confirmed it
+            self._base = min(_confidence(found), math.nextafter(self._reliable, 0.0))
+            warnings = _each_once(found.warnings + self._warnings)
+            return replace(found, probabilities=(self._base,), warnings=warnings)
         registered = self._registered(image, box, self._reliable)
         return (
             registered if isinstance(registered, Registration) and registered.reliable else refined

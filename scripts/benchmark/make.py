@@ -10,7 +10,7 @@ the same from most sides; ``shelf``, several printed packages side by side, all 
 packages or shapes are there to choose from; a shelf has --objects LOW HIGH of them. A scene has one
 photograph, or one for each of --cameras, or --frames of a moving camera. --cut LOW HIGH puts a
 fraction of the object outside the photograph; of a target that does not stand on a shelf
---occlusion LOW HIGH is hidden; --motion LOW HIGH is the size of motion blur, in px; --bare is the
+--occlusion LOW HIGH is hidden; --motion LOW HIGH blurs by up to half of LOW to HIGH px along each axis; --bare is the
 fraction of the objects that get one uniform colour. To calibrate confidence,
 --cad annotates an object as another one: similar, of its kind; wrong, any other; print, a package
 of the same shape with another print; mirrored, a tied shape's mirror image; variant, the shape with
@@ -63,7 +63,7 @@ TWINS = ("print", "mirrored", "variant")
 """Of these an object is annotated as another one, which has its number and ``TWIN``."""
 
 TWIN = 100_000
-ATTEMPTS = 60  # at a scene of which little enough is hidden
+ATTEMPTS = 60  # at a scene of which as much is hidden as is asked for
 COARSE = 5  # times smaller, a picture from which an attempt is given up
 MIN_PIXELS = 400  # of a silhouette; smaller ones are not annotated
 PART_AREA = (0.08, 0.5)  # fraction of the surface that differs in a variant
@@ -419,13 +419,13 @@ def make_scene(objects: Packages, options: Namespace, index: int) -> None:
         return
     for attempt in range(ATTEMPTS):
         scene, annotated = compose(objects, options, index, attempt)
-        if options.occlusion[0] > 0.0 and hidden_of(scene) < options.occlusion[0]:
+        low, high = options.occlusion
+        if options.kind != "shelf" and low > 0.0 and hidden_of(scene) < low:
             continue
         pictures = [scene.render(view, SIZE) for view in scene.views]
         seen = np.array([picture.seen.sum(axis=(1, 2)) for picture in pictures])
         whole = np.array([picture.whole.sum(axis=(1, 2)) for picture in pictures])
         hidden = 1.0 - seen / np.maximum(whole, 1)
-        low, high = options.occlusion
         in_sight = options.kind == "shelf" or low <= hidden.min() <= hidden.max() <= high
         if in_sight and (whole[:, 0] >= MIN_PIXELS).all():
             break

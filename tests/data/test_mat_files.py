@@ -101,6 +101,27 @@ def test_no_file_counts_as_damaged_where_scipy_does_not_start(tmp_path, monkeypa
         read(tmp_path / "a.mat")
 
 
+def test_damaged_files_have_a_value_or_none(tmp_path):
+    whole = tmp_path / "whole.mat"
+    write_record(whole, [pascal_object("car"), pascal_object("sofa")])
+    # without compression damage reaches further
+    scipy.io.savemat(whole, {"record": scipy.io.loadmat(whole)["record"]})
+    content = whole.read_bytes()
+    rng = np.random.default_rng(0)
+    paths = []
+    for number in range(40):
+        part = content[: rng.integers(100, len(content))] if rng.random() < 0.3 else content
+        data = bytearray(part)
+        for position in rng.integers(0, len(data), rng.integers(1, 8)):
+            data[position] = rng.integers(0, 256)
+        paths.append(tmp_path / f"{number}.mat")
+        paths[-1].write_bytes(data)
+    values = list(read_mats([*paths, whole], "record"))
+    assert len(values) == 41
+    assert values.count(None) > 10
+    assert [entry["class"] for entry in values[-1][0]["objects"]] == ["car", "sofa"]
+
+
 def test_a_file_that_is_read_at_the_time_limit_is_not_lost(monkeypatch):
     calls = []
 

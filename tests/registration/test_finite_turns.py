@@ -19,24 +19,53 @@ from tests._support import CAMERA, SIZE, double, seeded
 from tests._support.scenes import bank_around, exact_registrar, seen_from
 
 
-@cache
 def bottle(depth):
-    """A bottle that is 1.6 wide, with a narrow neck: its registrar, and a photograph and box of it
-    from the broad side."""
+    """1.6 wide and ``depth`` deep, with a narrow neck."""
     body = trimesh.creation.cylinder(radius=1.0, height=1.2, sections=64)
     body.apply_scale((0.8, 0.5 * depth, 1.0))
     neck = trimesh.creation.cylinder(radius=0.2, height=0.5, sections=48)
     neck.apply_translation((0.0, 0.0, 0.85))
-    registrar = exact_registrar(bank_around(trimesh.util.concatenate([body, neck]), 30, [0]))
-    T = seen_from(registrar.bank.mesh.surface, 0.0, 0.0, 4.5)
+    return trimesh.util.concatenate([body, neck])
+
+
+def mug():
+    """With a handle behind it, so that it is not round about the middle of its box."""
+    body = trimesh.creation.cylinder(radius=1.0, height=1.6, sections=96)
+    handle = trimesh.creation.box((0.5, 0.25, 0.9))
+    handle.apply_translation((1.15, 0.0, 0.0))
+    return trimesh.util.concatenate([body, handle])
+
+
+def flat_disc():
+    """Two turns of it are open."""
+    body = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=64)
+    body.apply_scale((1.0, 0.3, 1.0))
+    return body
+
+
+MESHES = {
+    "flat bottle": (lambda: bottle(1.0), 0.0, 0.0),
+    "deep bottle": (lambda: bottle(1.5), 0.0, 0.0),
+    "mug": (mug, 270.0, 0.0),
+    "flat disc": (flat_disc, 0.0, 0.0),
+}
+"""By name: a mesh, and azimuth and elevation from which it is photographed."""
+
+
+@cache
+def photographed(name):
+    """The registrar of a mesh, a pose, and a photograph and its box."""
+    mesh, azimuth, elevation = MESHES[name]
+    registrar = exact_registrar(bank_around(mesh(), 30, [0]))
+    T = seen_from(registrar.bank.mesh.surface, azimuth, elevation, 4.5)
     image, box = synthesize_photograph(registrar.bank.mesh, T, CAMERA, SIZE, seeded(0))
     return registrar, T, image, box
 
 
-def turn_deviations(depth):
+def turn_deviations(name):
     """Standard deviations (3,) in rad of the true rotation, the largest last, by contours alone and
     with finite turns."""
-    registrar, T, image, box = bottle(depth)
+    registrar, T, image, box = photographed(name)
     (item,) = as_photographs([image], [box], CAMERA)
     block = rank(registrar, [item], describe(registrar, [item]))
     none = torch.zeros(1, dtype=torch.long)
@@ -50,22 +79,31 @@ def turn_deviations(depth):
 
 
 def test_a_finite_turn_determines_what_contours_leave_open_to_first_order():
-    before, after = turn_deviations(1.0)
+    before, after = turn_deviations("flat bottle")
     assert before[2] > 3.0
     assert 0.1 < after[2] < 0.3
     assert torch.allclose(after[:2], before[:2], rtol=0.05)
 
 
-def test_a_finite_turn_that_changes_little_stays_open():
-    before, after = turn_deviations(1.5)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "deep bottle",  # its outline changes little
+        "mug",  # turned about the middle of its box, it would be shifted
+        "flat disc",
+    ],
+)
+def test_other_turns_stay_open(name):
+    before, after = turn_deviations(name)
     assert before[2] > 3.0
+    assert (before[1] > 3.0) == (name == "flat disc")
     assert after.equal(before)
 
 
 def test_a_turn_that_only_this_photograph_leaves_open_stays_open(monkeypatch):
     """Edges that the mesh predicts are missing: perhaps it is another object."""
     monkeypatch.setattr(judging, "ideal_covariance", lambda *_: 0.01 * torch.eye(6).double()[None])
-    before, after = turn_deviations(1.0)
+    before, after = turn_deviations("flat bottle")
     assert after.equal(before)
 
 
@@ -77,7 +115,7 @@ def test_the_smaller_loss_at_30_degrees_gives_the_deviation(monkeypatch, left, i
     monkeypatch.setattr(
         judging, "with_evidence", lambda _, __, poses: replace(poses, evidence=evidence)
     )
-    before, after = turn_deviations(1.0)
+    before, after = turn_deviations("flat bottle")
     if is_determined:
         density = math.exp(-0.5 * (math.radians(30.0) / float(after[2])) ** 2)
         assert density == pytest.approx(math.exp(-10.0 * (1.0 - left)), rel=0.01)
@@ -86,6 +124,6 @@ def test_the_smaller_loss_at_30_degrees_gives_the_deviation(monkeypatch, left, i
 
 
 def test_registrations_contain_finite_turns():
-    registrar, _, image, box = bottle(1.0)
+    registrar, _, image, box = photographed("flat bottle")
     (found,) = registrar([image], [box], CAMERA)
     assert found.confidence_features["undetermined"] < 1.0

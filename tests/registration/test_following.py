@@ -344,24 +344,31 @@ def zoomed(image, factor):
     return torch.nn.functional.interpolate(middle, SIZE, mode="bilinear")[0]
 
 
-@pytest.mark.parametrize(("factor", "checks"), [(1.1, [0, 0]), (1.25, [1, 1])])
-def test_a_pose_at_another_distance_is_checked_once_for_another_zoom(monkeypatch, factor, checks):
-    """The tracker is as certain as before, and the registration, which is not, is not followed."""
+@pytest.mark.parametrize(
+    ("factor", "refined", "base"),
+    [(1.1, None, 1.0), (1.25, 0.6, 0.9), (1.25, None, 0.9), (1.25, 0.97, 0.97)],
+)
+def test_a_pose_at_another_distance_is_checked_once_for_another_zoom(
+    monkeypatch, factor, refined, base
+):
+    """The tracker is as certain as before; unless the check is, its poses are not reliable."""
     monkeypatch.setattr(tracking, "is_calibrated", lambda _: True)
     monkeypatch.setattr(tracking, "tracking_confidence", lambda _: 1.0)
     warning = "the photograph shows a focal length of about 400 px"
     follow = follower()
-    counted = []
     frames = sequence(3)[1:]
-    refined = replace(answer(frames[0][2], 0.6), warnings=(warning,))
-    refine = Mock(return_value=refined)
+    T = frames[0][2]
+    checked = LOST if refined is None else Mock()
+    if refined is not None:
+        checked.return_value = replace(answer(T, refined), warnings=(warning,))
+    refine = Mock(wraps=checked)
     monkeypatch.setattr(tracking, "refine_one", refine)
     for image, _, _ in frames:
         result = follow(zoomed(image, factor))
-        counted.append(refine.call_count)
-        assert result.confidence == 1.0
-        assert result.warnings == (warning,) * counted[0]
-    assert counted == checks
+        assert result.warnings == (warning,) * (refined is not None)
+        assert result.confidence == pytest.approx(base)
+        assert result.reliable == (base > 0.9 and not result.warnings)
+    assert refine.call_count == (factor > 1.2)
 
 
 def test_a_refined_pose_of_no_confidence_is_not_followed(monkeypatch):
