@@ -10,8 +10,8 @@ the same from most sides; ``shelf``, several printed packages side by side, all 
 packages or shapes are there to choose from; a shelf has --objects LOW HIGH of them. A scene has one
 photograph, or one for each of --cameras, or --frames of a moving camera. --cut LOW HIGH puts a
 fraction of the object outside the photograph; of a target that does not stand on a shelf
---occlusion LOW HIGH is hidden; --motion LOW HIGH blurs by up to half of LOW to HIGH px along each axis; --bare is the
-fraction of the objects that get one uniform colour. To calibrate confidence,
+--occlusion LOW HIGH is hidden; --motion LOW HIGH blurs by up to half of that in px along each axis;
+--bare is the fraction of the objects that get one uniform colour. To calibrate confidence,
 --cad annotates an object as another one: similar, of its kind; wrong, any other; print, a package
 of the same shape with another print; mirrored, a tied shape's mirror image; variant, the shape with
 one part folded, moved, left out, or of another size. Scene i depends only on the seed, --models and
