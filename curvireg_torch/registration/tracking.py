@@ -352,9 +352,8 @@ class Follower:
     registration confirmed. If that registration is not reliable, the frames that follow are not
     either; they are checked again after 8 frames, 16, 32 and so on. A frame whose distance has
     changed by 15 % is checked too, as the lens may have zoomed, and reliable only if that confirms
-    it. What a registration warns of camera
-    and mesh holds for all later frames. No pose gains confidence from being followed, unless a
-    further registration is reliable.
+    it. What a registration warns of camera and mesh holds for all later frames. No pose gains
+    confidence from being followed, unless a further registration is reliable.
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
@@ -538,8 +537,8 @@ class Follower:
 
     def _is_trusted(self, tracked: TrackedPose, found: Registration) -> bool:
         """Whether a tracked pose stands without a refinement; counts the frames without a reliable
-        pose, and remembers the distance of the last check. In the next frame the tracker, which learns from it, finds even a wrong one with
-        certainty."""
+        pose, and remembers the distance of the last check. In the next frame the tracker, which
+        learns from it, finds even a wrong one with certainty."""
         assert self._base is not None
         if _confidence(found) < TRUSTED_CONFIDENCE:
             return False
