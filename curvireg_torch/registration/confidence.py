@@ -181,8 +181,12 @@ def undetermined_axes(covariance: Tensor, symmetries: Tensor | None = None) -> f
         return 3.0
     deviations = torch.linalg.eigvalsh(rotation.double()).clamp(min=0.0).sqrt()
     undetermined = float(deviations.clamp(max=1.0).sum())
-    is_round = symmetries is not None and len(symmetries) >= ROUND
-    return max(undetermined - 1.0, 0.0) if is_round else undetermined
+    return max(undetermined - 1.0, 0.0) if is_round(symmetries) else undetermined
+
+
+def is_round(symmetries: Tensor | None) -> bool:
+    """Whether these (S, 4, 4) are the symmetries of a body of revolution."""
+    return symmetries is not None and len(symmetries) >= ROUND
 
 
 def confidence_features(

@@ -29,6 +29,7 @@ from .confidence import (
     confidence_features,
     hypothesis_probabilities,
     is_calibrated,
+    is_round,
     probability_of_any,
     ranking_share,
     shares,
@@ -130,8 +131,11 @@ def with_determined_turns(
     little about its axis: to first order nothing determines that turn. By 30 degrees they change
     plainly, and what the score loses there gives the deviation of the turn. It counts only where
     the contours of the mesh leave the same turn open even if the photograph shows all of them. If
-    not, the photograph lacks edges that the mesh predicts: perhaps it shows another object.
+    not, the photograph lacks edges that the mesh predicts: perhaps it shows another object. The
+    turn of a body of revolution about its axis need not be determined.
     """
+    if is_round(block.symmetries):
+        return poses
     for row in poses.best(target.score_weights(exact=True)).split(1):
         covariance = _with_finite_turn(target, block, crops, poses[row])
         if covariance is not None:

@@ -380,7 +380,11 @@ def simulate_camera(picture: Array, rng: Rng) -> Array:
     if rng.random() < 0.5:
         picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 1.6))
     if rng.random() < 0.1:  # motion blur
-        picture = motion_blur(picture, rng.integers(3, 8), rng)
+        length = rng.integers(3, 8)
+        kernel = np.zeros((length, length), np.float32)
+        end = rng.integers(0, length, 2).tolist()
+        cv2.line(kernel, (length // 2, length // 2), end, 1.0)
+        picture = cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
     if rng.random() < 0.35:  # low resolution
         scale = rng.uniform(0.35, 0.9)
         size = (int(width * scale), int(height * scale))
@@ -394,11 +398,3 @@ def simulate_camera(picture: Array, rng: Rng) -> Array:
         _, data = cv2.imencode(".jpg", coded, quality)
         coded = cv2.imdecode(data, cv2.IMREAD_COLOR)
     return coded
-
-
-def motion_blur(picture: Array, length: int, rng: Rng) -> Array:
-    """A picture (H, W, 3) of a camera that moved by up to half of ``length`` px along each axis."""
-    kernel = np.zeros((length, length), np.float32)
-    end = rng.integers(0, length, 2).tolist()
-    cv2.line(kernel, (length // 2, length // 2), end, 1.0)
-    return cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)

@@ -46,6 +46,7 @@ def flat_disc():
 MESHES = {
     "flat bottle": (lambda: bottle(1.0), 0.0, 0.0),
     "deep bottle": (lambda: bottle(1.5), 0.0, 0.0),
+    "round bottle": (lambda: bottle(1.6), 0.0, 0.0),
     "mug": (mug, 270.0, 0.0),
     "flat disc": (flat_disc, 0.0, 0.0),
 }
@@ -97,6 +98,17 @@ def test_other_turns_stay_open(name):
     before, after = turn_deviations(name)
     assert before[2] > 3.0
     assert (before[1] > 3.0) == (name == "flat disc")
+    assert after.equal(before)
+
+
+def test_the_turn_of_a_body_of_revolution_is_not_measured(monkeypatch):
+    """It is none of its pose, whatever a score says of it."""
+    evidence = replace(Evidence.zeros(3), similarity=double([1.0, 0.5, 0.5]))
+    monkeypatch.setattr(
+        judging, "with_evidence", lambda _, __, poses: replace(poses, evidence=evidence)
+    )
+    before, after = turn_deviations("round bottle")
+    assert before[2] > 3.0
     assert after.equal(before)
 
 
