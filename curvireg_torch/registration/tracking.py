@@ -514,8 +514,8 @@ class Follower:
             else [tracked.state.T, self._tracker.last_pose]
         )
         refined = self._refined(item, torch.cat(starts))
-        least = max(KEPT_CONFIDENCE, 0.0 if found is None else _confidence(found))
-        least = min(least, self._reliable)
+        own = 0.0 if found is None else _confidence(found)
+        least = min(max(KEPT_CONFIDENCE, own), self._reliable)
         if isinstance(refined, Registration) and _confidence(refined) >= least:
             # track on from it, if it lies within the frame
             with suppress(LostObjectError, ImageError):

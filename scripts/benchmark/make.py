@@ -10,14 +10,13 @@ the same from most sides; ``shelf``, several printed packages side by side, all 
 packages or shapes are there to choose from; a shelf has --objects LOW HIGH of them. A scene has one
 photograph, or one for each of --cameras, or --frames of a moving camera. --cut LOW HIGH puts a
 fraction of the object outside the photograph; of a target that does not stand on a shelf
---occlusion LOW HIGH is hidden; --motion LOW HIGH blurs by up to half of that in px along each axis;
---bare is the fraction of the objects that get one uniform colour. To calibrate confidence,
---cad annotates an object as another one: similar, of its kind; wrong, any other; print, a package
-of the same shape with another print; mirrored, a tied shape's mirror image; variant, the shape with
-one part folded, moved, left out, or of another size. Scene i depends only on the seed, --models and
-i; an interrupted run can be resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette inside
-the picture, ``bbox_visib`` of its visible part. OUT/benchmark.json holds the options, and the group
-of each object for scripts/calibration.
+--occlusion LOW HIGH is hidden; --bare is the fraction of the objects that get one uniform colour.
+To calibrate confidence, --cad annotates an object as another one: similar, of its kind; wrong, any
+other; print, a package of the same shape with another print; mirrored, a tied shape's mirror image;
+variant, the shape with one part folded, moved, left out, or of another size. Scene i depends only
+on the seed, --models and i; an interrupted run can be resumed. Boxes are exact: ``bbox_obj`` of the
+whole silhouette inside the picture, ``bbox_visib`` of its visible part. OUT/benchmark.json holds
+the options, and the group of each object for scripts/calibration.
 """
 
 import shutil
@@ -41,17 +40,7 @@ from scripts._shared import Record, in_processes, read_json, run, write_json
 from scripts.scenes.families import FAMILIES, random_shape
 from scripts.scenes.materials import random_texture
 from scripts.scenes.packages import package
-from scripts.scenes.scene import (
-    SIZE,
-    Scene,
-    View,
-    camera_path,
-    cut,
-    motion_blur,
-    shelf,
-    simulate_camera,
-    single,
-)
+from scripts.scenes.scene import SIZE, Scene, View, camera_path, cut, shelf, simulate_camera, single
 from scripts.scenes.surfaces import Array, Rng, middle_of
 from scripts.scenes.textured import Placed, TexturedMesh, plain_texture
 from scripts.scenes.tied import FAMILIES as TIED_FAMILIES
@@ -439,11 +428,7 @@ def make_scene(objects: Packages, options: Namespace, index: int) -> None:
     cameras = {}
     for k, (view, picture) in enumerate(zip(scene.views, pictures, strict=True)):
         seed = (options.seed, index, 0 if options.frames > 1 else k)  # one camera takes all frames
-        rng = np.random.default_rng(seed)
-        linear = picture.linear
-        if options.motion:
-            linear = motion_blur(linear, rng.integers(*options.motion), rng)
-        image = simulate_camera(linear, rng)
+        image = simulate_camera(picture.linear, np.random.default_rng(seed))
         cv2.imwrite(str(part / "rgb" / f"{k:06d}.png"), image[..., ::-1])
         cameras[k] = camera_row(scene, view)
         truths[k] = []
@@ -545,7 +530,6 @@ def main(
     objects: tuple[int, int] = (8, 20),
     occlusion: tuple[float, float] = (0.0, 0.6),
     cut: tuple[float, float] | None = None,
-    motion: tuple[int, int] | None = None,
     cameras: int = 1,
     frames: int = 1,
     jobs: int = 1,
