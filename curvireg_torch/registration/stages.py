@@ -6,13 +6,11 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from ..errors import CurviregError
 from ..evidence import EvidenceWeights
 from ..fitting.edges import EdgeCrops
-from ..geometry.crops import box_share, crop_transforms, square_boxes
-from ..geometry.framing import clipped, hidden_boxes, whole_boxes
+from ..geometry.framing import hidden_boxes, whole_boxes
 from ..matching import Ranking
 from ..matching.search import search
 from ..terms import QueryFeatures
@@ -40,6 +38,12 @@ from .camera import (
     with_possible_cameras,
 )
 from .confidence import are_near
+from .doubts import (
+    MIRROR_WARNING,
+    compared_with_input,
+    compared_with_mirror_image,
+    with_siblings,
+)
 from .hypotheses import (
     Hypotheses,
     are_repeated,
@@ -50,8 +54,7 @@ from .hypotheses import (
     with_edge_support,
     with_short_fit,
 )
-from .judging import best_of_meshes, judged, with_determined_turns, with_siblings
-from .mirror_image import MIRROR_WARNING, compared_with_mirror_image
+from .judging import best_of_meshes, judged, with_determined_turns
 from .photograph import Photograph, check_crop
 from .result import FailedRegistration, Registration, Results
 from .target import Target
@@ -66,22 +69,6 @@ SAME_BOX_OVERLAP = 0.98
 RELIABLE_OVERLAPS = (0.85, 0.0)
 # Confidences below it, or above 1 minus it, do not tell which of two boxes is right
 LEAST_CONFIDENCE = 0.005
-# Share of the smaller of the given box and that around the pose in the other one, below which the
-# pose lies elsewhere: of 246 reliable answers on twelve real sets it is 0.93 or more
-LEAST_SHARE = 0.6
-BESIDE_BOX = (
-    "the pose lies beside the box, perhaps on another copy of the object: check the overlay, and "
-    "draw the box around the one that is meant"
-)
-MASK_SIZE = 64  # side in px of a crop in which a mask is compared with the mesh at the pose
-MASK_REACH = 2  # px of it by which a mask may reach beyond the mesh
-# Share of a mask that must lie within this reach: of 24 generated objects it is 0.98 where mask and
-# pose are right, and at most 0.89 where the mask is shifted by a fifth of the object
-LEAST_MASK_SHARE = 0.9
-BESIDE_MASK = (
-    "the mask reaches far beyond the object at this pose: check that it is of this object alone, "
-    "and of this photograph"
-)
 VIEWS_OF_HIDDEN = 4  # best views that are tried in each box of an object behind an occluder
 
 
@@ -129,9 +116,7 @@ def register_photographs(
             if detect is None:
                 corrected = _with_best_corrected(of_meshes, best, meshes, some)
                 best = _best_of_each(corrected, meshes, some)
-                best = [
-                    _compared_with_input(meshes, *pair) for pair in zip(some, best, strict=True)
-                ]
+                best = [compared_with_input(meshes, *pair) for pair in zip(some, best, strict=True)]
             results += best
     return results
 
@@ -163,40 +148,6 @@ def _with_best_corrected(
         again = _in_corrected_boxes(mesh, items, chosen)
         corrected.append([again.get(k, result) for k, result in enumerate(results)])
     return corrected
-
-
-def _compared_with_input(
-    meshes: Sequence[Target],
-    item: Photograph | CurviregError,
-    result: Registration | FailedRegistration,
-) -> Registration | FailedRegistration:
-    """The result in a photograph, with a warning where its pose lies beside the given box: perhaps
-    on another copy of the object, of which the box shows a part; or beside the given mask."""
-    if not (isinstance(item, Photograph) and isinstance(result, Registration)):
-        return result
-    mesh = meshes[result.mesh_index]
-    found = []
-    box = projected_box(mesh.describer, result.projection)
-    if box_share(clipped(box, item.size), item.box.double()) < LEAST_SHARE:
-        found.append(BESIDE_BOX)
-    if mesh.is_exact and _mask_share(mesh, item, result.projection) < LEAST_MASK_SHARE:
-        found.append(BESIDE_MASK)
-    return replace(result, warnings=(*result.warnings, *found)) if found else result
-
-
-def _mask_share(target: Target, item: Photograph, projection: tuple[Tensor, Tensor]) -> float:
-    """Share of a photograph's mask that lies on the mesh at a pose, or near it; 1 without one."""
-    margin = target.describer.settings.margin
-    mask = item.mask_crop(MASK_SIZE, margin)
-    if mask is None:
-        return 1.0
-    T, K = projection
-    transform = crop_transforms(square_boxes(item.box[None].float(), margin), MASK_SIZE)
-    size = (MASK_SIZE, MASK_SIZE)
-    depth = target.describer.renderer.render(T[None], transform.double() @ K, size)
-    near = max_pool2d((depth > 0.0).float().cpu(), 2 * MASK_REACH + 1, 1, MASK_REACH)
-    white = (mask >= 0.5).float()
-    return float((white * near).sum() / white.sum()) if bool(white.any()) else 1.0
 
 
 def failure(error: CurviregError, index: int) -> FailedRegistration:

@@ -40,8 +40,8 @@ from ..utils.likes import ArrayLike, BoxLike, ImageLike
 from ..utils.threads import map_on_threads
 from .camera import SHOWN_FOCAL_LENGTH, STRETCHED
 from .confidence import RELIABLE, is_calibrated, tracking_confidence
+from .doubts import MIRROR_WARNING
 from .hypotheses import Hypotheses, hypothesis_of
-from .mirror_image import MIRROR_WARNING
 from .photograph import Photograph, as_photographs
 from .refinement import OUTSIDE, refine_one
 from .registrar import Registrar

@@ -15,7 +15,7 @@ from curvireg_torch.registration.confidence import (
     RELIABLE,
     LogisticModel,
 )
-from curvireg_torch.registration.mirror_image import MIRROR_DOUBT
+from curvireg_torch.registration.doubts import MIRROR_DOUBT
 from curvireg_torch.utils.arrays import Array
 from scripts._shared import RIGHT_DEG, Record
 from scripts.calibration.sets import SETS

@@ -28,7 +28,7 @@ from curvireg_torch.matching.detector import SAME_OBJECT_OVERLAP
 from curvireg_torch.mesh import Mesh
 from curvireg_torch.registration import Follower
 from curvireg_torch.registration.confidence import are_near
-from curvireg_torch.registration.mirror_image import MIRROR_WARNING
+from curvireg_torch.registration.doubts import MIRROR_WARNING
 from scripts._shared import RIGHT_DEG, Record, measured, read_json, request_digest
 from scripts.calibration.sets import photographs_of, set_of
 

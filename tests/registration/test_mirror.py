@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from curvireg_torch.geometry.cameras import projected
-from curvireg_torch.registration import mirror_image, stages
+from curvireg_torch.registration import doubts, stages
 from curvireg_torch.registration.photograph import as_photograph
 from tests._support import (
     CAMERA,
@@ -44,7 +44,7 @@ def test_a_mirror_shows_the_mirror_image_of_a_mesh():
     """Points of the mesh project onto the flipped photograph where those of the image are."""
     item = as_photograph(*scene(0)[:2], None, mask=torch.rand(SIZE))
     K = double([[200.0, 0.0, 100.0], [0.0, 210.0, 80.0], [0.0, 0.0, 1.0]])
-    seen = mirror_image.flipped(item, K)
+    seen = doubts.flipped(item, K)
     points = torch.rand(5, 3, dtype=torch.float64) + double([-0.5, -0.5, 2.0])
     uv = projected(points, eye(4)[None], K[None])[0]
     in_mirror = projected(
@@ -57,17 +57,17 @@ def test_a_mirror_shows_the_mirror_image_of_a_mesh():
     assert torch.equal(seen.mask[..., 7], item.mask[..., last - 7])
     x0, y0, x1, y1 = item.box.tolist()
     assert seen.box.tolist() == pytest.approx([last - x1, y0, last - x0, y1])
-    again = mirror_image.flipped(seen, seen.K)
+    again = doubts.flipped(seen, seen.K)
     assert torch.equal(again.image, item.image)
     assert torch.equal(again.K, K)
 
 
 def test_confidence_falls_where_the_mirror_image_fits_better_and_is_another_mesh(monkeypatch):
     for gain, is_same, is_doubted in ((0.4, False, False), (1.5, False, True), (1.5, True, False)):
-        monkeypatch.setattr(mirror_image, "mirror_gain", Mock(return_value=double([gain])))
-        monkeypatch.setattr(mirror_image, "is_its_own_mirror_image", Mock(return_value=is_same))
+        monkeypatch.setattr(doubts, "mirror_gain", Mock(return_value=double([gain])))
+        monkeypatch.setattr(doubts, "is_its_own_mirror_image", Mock(return_value=is_same))
         result = answer_to(0, learned_registrar())
-        assert (mirror_image.MIRROR_WARNING in result.warnings) == is_doubted
+        assert (doubts.MIRROR_WARNING in result.warnings) == is_doubted
         assert result.reliable != is_doubted
         if is_doubted:
             assert result.confidence < 0.5
@@ -76,8 +76,8 @@ def test_confidence_falls_where_the_mirror_image_fits_better_and_is_another_mesh
 @pytest.mark.parametrize(("gain", "boxes"), [(-1.0, 3), (1.5, 1)])
 def test_a_mirrored_mesh_is_not_sought_in_other_boxes(gain, boxes, monkeypatch):
     """In which the flipped photograph may be seen in a wrong one."""
-    monkeypatch.setattr(mirror_image, "LEAST_CONFIDENCE", 0.0)
-    monkeypatch.setattr(mirror_image, "mirror_gain", lambda *given: double([gain] * len(given[-1])))
+    monkeypatch.setattr(doubts, "LEAST_CONFIDENCE", 0.0)
+    monkeypatch.setattr(doubts, "mirror_gain", lambda *given: double([gain] * len(given[-1])))
     registered = spied(monkeypatch, stages, "register_boxes")
     image, box, _ = scene(0)
     answer_of(truck_registrar(box_jitter=0.1), image, box + double([0.0, 0.0, 12.0, 12.0]))
@@ -85,22 +85,22 @@ def test_a_mirrored_mesh_is_not_sought_in_other_boxes(gain, boxes, monkeypatch):
 
 
 def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
-    given = spied(monkeypatch, mirror_image, "mirror_gain")
+    given = spied(monkeypatch, doubts, "mirror_gain")
     bank = bank_around(mirrored(learned_registrar().bank.mesh.surface), 30, [0, 30, 60])
-    monkeypatch.setattr(mirror_image, "LEAST_CONFIDENCE", 0.0)
+    monkeypatch.setattr(doubts, "LEAST_CONFIDENCE", 0.0)
     image, box, _ = scene(0)
     last = image.shape[-1] - 1
     x0, y0, x1, y1 = box.tolist()
     boxes = torch.tensor([[last - x1, y0, last - x0, y1], [x0, y0, x1, y1]])
     both = exact_registrar(bank)([image.flip(-1), image], boxes, CAMERA)
-    assert [mirror_image.MIRROR_WARNING in result.warnings for result in both] == [False, True]
-    right, wrong = mirror_image.mirror_gain(*given[0])
+    assert [doubts.MIRROR_WARNING in result.warnings for result in both] == [False, True]
+    right, wrong = doubts.mirror_gain(*given[0])
     assert right < -1.0
     assert wrong > 1.0
     *known, best = given[0]
-    alone = mirror_image.mirror_gain(*known, best[[1]])
+    alone = doubts.mirror_gain(*known, best[[1]])
     assert alone.tolist() == pytest.approx([float(wrong)], abs=0.05)
-    monkeypatch.setattr(mirror_image, "LESS_ALIKE", 0.0)
-    right, wrong = mirror_image.mirror_gain(*given[0])
+    monkeypatch.setattr(doubts, "LESS_ALIKE", 0.0)
+    right, wrong = doubts.mirror_gain(*given[0])
     assert right == -torch.inf
     assert wrong > 1.0

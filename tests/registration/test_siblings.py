@@ -11,9 +11,9 @@ from torch.testing import assert_close
 
 from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
-from curvireg_torch.registration import judging
+from curvireg_torch.registration import doubts
+from curvireg_torch.registration.doubts import Siblings
 from curvireg_torch.registration.hypotheses import Hypotheses
-from curvireg_torch.registration.judging import Siblings
 from curvireg_torch.registration.target import TellingSymmetries
 from tests._support import double, eye, zeros
 from tests._support.hypotheses import competing, evidence_of, poses_at, target_of
@@ -75,12 +75,12 @@ class Case:
         self.symmetries = transform(rotation_from_axis_angle(angles), zeros(3, 3))
         self.poses = four([0.0] * 3, [[0.0] * 3] * 3, [0, 40, 80]).poses
         different = ~torch.eye(3, dtype=torch.bool)
-        monkeypatch.setattr(judging, "fitted_poses", self.fit)
-        monkeypatch.setattr(judging, "by_contours", lambda *_: torch.arange(3))
-        monkeypatch.setattr(judging, "compared", lambda _: (zeros(3, 3), different))
+        monkeypatch.setattr(doubts, "fitted_poses", self.fit)
+        monkeypatch.setattr(doubts, "by_contours", lambda *_: torch.arange(3))
+        monkeypatch.setattr(doubts, "compared", lambda _: (zeros(3, 3), different))
         evidence = {3: evidence_of(*measured), 1: evidence_of(0.95)}
         monkeypatch.setattr(
-            judging,
+            doubts,
             "with_evidence",
             lambda _, __, poses: replace(poses, evidence=evidence[len(poses)]),
         )
@@ -104,7 +104,7 @@ class Case:
         block.keeps = lambda poses: torch.tensor([next(answers, True)] * len(poses))
         crops = None
         before = competing(self.poses, evidence_of(0.99, 0.9, 0.5), [True, False, False])
-        after, rival, _ = judging.with_siblings(target, block, crops, before)
+        after, rival, _ = doubts.with_siblings(target, block, crops, before)
         assert not rival.is_outside.any()
         assert rival.is_sibling.all()
         return after, after.evidence, rival
