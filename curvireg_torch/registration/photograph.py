@@ -20,6 +20,7 @@ from ..data.images import Photo, photo_of_picture, read_photo
 from ..errors import CurviregError, ImageError, InvalidInputError
 from ..formats.masks import mask_of_values, read_mask
 from ..geometry.calibration import Camera, undistorted
+from ..geometry.cameras import camera_numbers
 from ..geometry.crops import box_iou, check_boxes, crop_squares, square_boxes, whole_image_box
 from ..geometry.framing import clipped
 from ..geometry.pose_prior import PosePrior
@@ -448,7 +449,7 @@ def check_crop(crop: Tensor) -> None:
 
 def camera_warnings(K: Tensor, size: tuple[int, int]) -> list[str]:
     """What is questionable about a valid (3, 3) camera matrix of an (H, W) photograph."""
-    fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    fx, fy, cx, cy = camera_numbers(K)
     H, W = size
     found = []
 

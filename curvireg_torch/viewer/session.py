@@ -43,6 +43,19 @@ STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of
 Registered = tuple[Registration, Fields, Sequence[Photograph], list[Tensor | None]]
 GivenCamera = Numbers | Camera | str | float | None  # see RegisterOptions.camera
 UNPACKED = "parts"  # the folder of what was in an archive
+# Why there is no command line for what is shown
+UNDISTORTED = (
+    "None: the command line takes the box in the photograph as it was taken, the page in the "
+    "undistorted one."
+)
+UNCERTAIN = (
+    "None: four numbers do not tell how uncertain the calibration's focal length is; give its file "
+    "as --camera FILE."
+)
+NOT_IN_RIG = (
+    "None: first write the boxes that were drawn here into the columns x0 to y1 of the rig, and "
+    "open all photographs."
+)
 
 
 @dataclass
@@ -376,25 +389,25 @@ class Session:
         box = None if shot.view is not None else shot.box
         return replace(self.options, photos=photos, meshes=meshes, box=box, camera=camera)
 
-    def command(self) -> str:
-        """The command line that gives the same result; none takes the box of an undistorted
-        photograph, four numbers whose focal length is uncertain, or boxes and photographs that a
-        rig does not have."""
+    def lacks_command(self) -> str:
+        """Why no command line gives the same result; empty if one does."""
         if self.shot.view is None:
             camera = self.options.camera
-            is_uncertain = isinstance(camera, Camera) and camera.focal_deviation > 0.0
-            has_command = not (is_uncertain or self.shot.is_undistorted)
-            return command_line(self.request(), self.usable_name) if has_command else ""
+            if self.shot.is_undistorted:
+                return UNDISTORTED
+            return UNCERTAIN if isinstance(camera, Camera) and camera.focal_deviation > 0.0 else ""
         shots = self.together()
-        if (
-            self.rig_path is None
-            or len(shots) < len(self.rig)
-            or not all(shot.has_box_of_view for shot in shots)
-        ):
+        is_whole = self.rig_path is not None and len(shots) == len(self.rig)
+        return "" if is_whole and all(shot.has_box_of_view for shot in shots) else NOT_IN_RIG
+
+    def command(self) -> str:
+        """The command line that gives the same result, if there is one."""
+        if self.lacks_command():
             return ""
-        return command_line(
-            self.request(), self.name, "SCENE" if self.rig_path.is_dir() else self.rig_name
-        )
+        path = self.rig_path if self.shot.view is not None else None
+        if path is None:
+            return command_line(self.request(), self.usable_name)
+        return command_line(self.request(), self.name, "SCENE" if path.is_dir() else self.rig_name)
 
     def register(self) -> Registration:
         """Find the pose in the photograph that is shown, as ``curvireg register`` does, or in those

@@ -63,18 +63,6 @@ VERDICTS = {
 # Pictures a second of a scene, with and without the pointer on it
 FPS_IN_USE = 20
 FPS_AT_REST = 2
-UNDISTORTED = (
-    "None: the command line takes the box in the photograph as it was taken, the page in the "
-    "undistorted one."
-)
-UNCERTAIN = (
-    "None: four numbers do not tell how uncertain the calibration's focal length is; give its file "
-    "as --camera FILE."
-)
-NOT_IN_RIG = (
-    "None: first write the boxes that were drawn here into the columns x0 to y1 of the rig, and "
-    "open all photographs."
-)
 EXPECTED = {
     4: "four numbers fx fy cx cy in px, such as 1450 1450 960 540",
     1: "the horizontal field of view in degrees, such as 65",
@@ -313,11 +301,7 @@ class Inputs(Panel):
     async def refresh(self) -> None:
         """Show what changed in the session since the last time, here or in another window."""
         session = self.session
-        view = self.session.shot.view
-        reason = NOT_IN_RIG
-        if view is None:
-            reason = UNDISTORTED if session.shot.is_undistorted else UNCERTAIN
-        set_text(self.command, session.command() or reason)
+        set_text(self.command, session.command() or session.lacks_command())
         set_text(self.python, "" if session.shot.answer is None else session.python())
         for name, select in self.selects.items():
             if select.value != getattr(session.options, name):
