@@ -13,7 +13,7 @@ pytest.importorskip("sklearn")
 from curvireg_torch.geometry import transform
 from curvireg_torch.geometry.framing import outside_fraction
 from curvireg_torch.jobs import runner
-from curvireg_torch.registration.mirror_image import MIRROR_DOUBT
+from curvireg_torch.registration.doubts import MIRROR_DOUBT
 from curvireg_torch.synthetic import example_mesh
 from scripts.benchmark.make import TWIN, Packages, Shapes, Tied
 from scripts.calibration import fits, measure, sets
