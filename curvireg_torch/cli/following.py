@@ -199,6 +199,9 @@ def _poses(
             box: Any = _box(options, name, photo, is_first=is_first)
             is_first = False
             if isinstance(options.camera, Camera):
+                if options.camera.size is None:  # it is of frames as large as the first
+                    size = (image.shape[-2], image.shape[-1])
+                    options = replace(options, camera=options.camera.at(size))
                 seen = undistorted(
                     image, options.camera, None if box is None else torch.tensor(box)
                 )

@@ -41,7 +41,8 @@ def print_result(document: Document, out: Path) -> None:
             for name in ("rotation_deg", "translation")
         )
         values = f"{rotation} degrees; {translation} {document['unit']}"
-        print(f"standard deviations: {values}   (about and along the camera's axes)")
+        axes = f"about and along the {document['frame']}'s axes"
+        print(f"standard deviations: {values}   ({axes})")
     seconds = document["seconds"]
     print(
         f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see "

@@ -22,7 +22,7 @@ VERSIONS = {
 }
 CONVENTIONS = {  # docs/results.md describes all keys
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of "
-    "the mesh file",
+    "the mesh file; x_world in place of x_cam where the frame is the world",
     "translation": "in the mesh file's unit; null with a similar mesh and no camera",
     "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
     "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF "
@@ -31,7 +31,7 @@ CONVENTIONS = {  # docs/results.md describes all keys
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
     "reliable": "confidence of at least pipeline.fit.reliable, and nothing questionable; false = "
     "the pose is a guess",
-    "covariance": "of rotation (rad) about the camera's x, y, z, then translation along them: "
+    "covariance": "of rotation (rad) about x, y, z of the frame, then translation along them: "
     "R_true = exp([w]x) R, "
     "t_true = t + e; of the camera's errors, that of an estimated focal length is in it",
 }

@@ -130,7 +130,8 @@ def refine(
             known, as those of earlier results are.
 
     Returns:
-        For each photograph its refined poses, best first. A :class:`FailedRegistration` with
+        For each photograph its refined poses, best first; where it hides the feature that tells
+        turns of the mesh apart, the other turn is its rival. A :class:`FailedRegistration` with
         :class:`LostObjectError` where the object is not near any start.
 
     Raises:
@@ -200,7 +201,7 @@ def refine_one(
     poses = _fitted(target, item, described, crops, T)
     evidence = evidence_of(target, described, poses)
     scores = evidence.scores(target.score_weights(exact=True))
-    symmetries = target.symmetries_of(exact=True)
+    symmetries = target.symmetries_of_answers(feature_is_hidden=False)
     distinct = distinct_poses(poses.rotation, scores, symmetries, angle=settings.same_pose_angle)
     order = scores.argsort(descending=True, stable=True)
     order = order[distinct[order]]
@@ -219,15 +220,21 @@ def refine_one(
         )
     warnings = item.warnings + target.mesh_warnings
     probabilities: tuple[float, ...] = ()
+    feature_is_hidden = False
     if is_calibrated(target.pipeline):
         registered = _registered(target, item, poses[best])
+        near, siblings = _near(target, registered, poses.rotation[best[0]])
         probability = min(
             confidence,
-            _probability_near(target, registered, poses.rotation[best[0]]),
+            sum(registered.probabilities[k] for k in near),
+            registered.confidence_bound,
             1.0 if limit is None else limit,
         )
-        probabilities = (probability, *[0.0] * (len(hypotheses) - 1))
+        others = [registered.probabilities[k] for k in siblings]
+        probabilities = (probability, *others, *[0.0] * (len(hypotheses) - 1))
+        hypotheses = (hypotheses[0], *[registered.hypotheses[k] for k in siblings], *hypotheses[1:])
         warnings = registered.warnings
+        feature_is_hidden = registered.feature_is_hidden
     return Registration(
         hypotheses,
         probabilities,
@@ -236,6 +243,7 @@ def refine_one(
         warnings=warnings,
         notes=target.mesh_notes,
         camera=item.pinhole,
+        feature_is_hidden=feature_is_hidden,
         reliable_from=settings.reliable,
     )
 
@@ -299,10 +307,15 @@ def _registered(target: Target, item: Photograph, pose: Hypotheses) -> Registrat
     return register(target.with_hypotheses(COMPARED), [item], query)[0]
 
 
-def _probability_near(target: Target, registered: Registration, rotation: Tensor) -> float:
-    """Probability of a pose with this ``rotation`` (3, 3) in a registration: that of the hypotheses
-    within 30 degrees of it, and at most its bound."""
-    rotations = [hypothesis.allocentric_rotation for hypothesis in registered.hypotheses]
-    near = are_near(torch.stack(rotations), rotation, target.symmetries_of(exact=target.is_exact))
-    pairs = zip(registered.probabilities, near.tolist(), strict=True)
-    return min(sum(p for p, is_near in pairs if is_near), registered.confidence_bound)
+def _near(
+    target: Target, registered: Registration, rotation: Tensor
+) -> tuple[list[int], list[int]]:
+    """Numbers of the hypotheses of a registration within 30 degrees of a ``rotation`` (3, 3), and
+    of those that only a feature tells from them that the photograph hides."""
+    is_hidden = registered.feature_is_hidden
+    rotations = torch.stack([each.allocentric_rotation for each in registered.hypotheses])
+    same = target.symmetries_of_answers(feature_is_hidden=is_hidden)
+    near = are_near(rotations, rotation, same)
+    alike = are_near(rotations, rotation, target.symmetries_of(exact=target.is_exact))
+    siblings = alike & ~near if is_hidden else torch.zeros_like(near)
+    return near.nonzero()[:, 0].tolist(), siblings.nonzero()[:, 0].tolist()

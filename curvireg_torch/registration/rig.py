@@ -181,9 +181,11 @@ class Rig:
         self.photographs = photographs
         self.exact = target.is_exact
         self.score_weights = target.score_weights(exact=self.exact)
-        symmetries = target.symmetries_of(exact=self.exact)
-        self.symmetries = (
-            torch.eye(3)[None].double() if symmetries is None else symmetries[:, :3, :3].double()
+        # which the views of the bank do not tell apart
+        self.symmetries = _rotations(target.symmetries_of(exact=self.exact))
+        self.feature_is_hidden = all(p.result.feature_is_hidden for p in photographs)
+        self.answer_symmetries = _rotations(
+            target.symmetries_of_answers(feature_is_hidden=self.feature_is_hidden)
         )
         self.cameras = torch.stack([p.camera for p in photographs])
         self.eyes = -(self.cameras[:, :3, :3].mT @ self.cameras[:, :3, 3:])[..., 0]
@@ -279,10 +281,10 @@ class Rig:
                 kept.append(k)
         return torch.tensor(kept)
 
-    def angles(self, R: Tensor, others: Tensor) -> Tensor:
-        """(M, N) degrees between rotations (M, 3, 3) and (N, 3, 3), or those of poses, up to
-        symmetries."""
-        return angles_between(R[:, :3, :3], others[:, :3, :3], self.symmetries)
+    def angles(self, T: Tensor, others: Tensor) -> Tensor:
+        """(M, N) degrees between the rotations of poses (M, 4, 4) and (N, 4, 4), up to symmetries
+        after which they are the same answer."""
+        return angles_between(T[:, :3, :3], others[:, :3, :3], self.answer_symmetries)
 
     def ranks(self, T: Tensor) -> Tensor:
         """(V, M) log S of the best view of the bank near world poses, minus that of the best view
@@ -292,7 +294,7 @@ class Rig:
         for photograph in self.photographs:
             scores = photograph.rankings[0].scores[0].cpu().double()
             log = scores.clamp(min=torch.finfo(torch.float64).tiny).log()
-            angles = self.angles(self.allocentric(photograph, T)[0], views)
+            angles = angles_between(self.allocentric(photograph, T)[0], views, self.symmetries)
             near = angles <= angles.amin(dim=1, keepdim=True).clamp(min=SAME_ANGLE)
             ranks.append(torch.where(near, log, -torch.inf).amax(dim=1) - log.max())
         return torch.stack(ranks)
@@ -399,7 +401,7 @@ class Rig:
         P = in_frames(self.cameras[:, :3, :3])
         unknown = torch.full((6, 6), torch.nan).double()
         C = torch.stack([unknown if h.covariance is None else h.covariance for h in found])
-        scores = evidence.scores(self.score_weights)
+        scores = _bounded(evidence.scores(self.score_weights))
         return JointPoses(photograph.poses, evidence, scores, P.mT @ C @ P)
 
     def covariances(self, T: Tensor, state: ContourState) -> Tensor:
@@ -498,6 +500,11 @@ class Rig:
             edge_support=evidence["edge_support"],
             covariance=C.clone() if bool(C.isfinite().all()) else None,
         )
+
+
+def _rotations(symmetries: Tensor | None) -> Tensor:
+    """(S, 3, 3) of symmetries (S, 4, 4), the identity for None."""
+    return torch.eye(3).double()[None] if symmetries is None else symmetries[:, :3, :3].double()
 
 
 def _inverse(covariance: Tensor) -> Tensor:

@@ -241,6 +241,7 @@ def _registration(
         confidence_features=features,
         warnings=_warnings(rig, every, answer.T[:1]),
         notes=first.result.notes,
+        feature_is_hidden=rig.feature_is_hidden,
         views=tuple(views),
         reliable_from=target.pipeline.fit.reliable,
     )

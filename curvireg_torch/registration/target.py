@@ -14,7 +14,7 @@ from torch import Tensor
 from ..evidence import RANK_ALONE, EvidenceWeights
 from ..fitting.keypoints import KeypointMatches, Keypoints
 from ..geometry.framing import CropFrame, around_visible, border_sides, photograph_box
-from ..geometry.viewpoint import rotation_error
+from ..geometry.viewpoint import angles_between, rotation_error
 from ..matching import ViewDescriber, ViewMatcher
 from ..matching.detector import Detector
 from ..mesh import Mesh, mesh_radius, mesh_symmetries
@@ -38,10 +38,12 @@ class TellingSymmetries:
 
     Attributes:
         transforms: (K, 4, 4), the identity first.
+        others: (S, 4, 4) that no feature tells from it, the identity first.
         notable: whether the feature has ``NOTABLE_FRACTION`` of the surface.
     """
 
     transforms: Tensor
+    others: Tensor
     notable: bool = False
 
     def __len__(self) -> int:
@@ -50,14 +52,18 @@ class TellingSymmetries:
 
 def telling_symmetries(mesh: trimesh.Trimesh, symmetries: Tensor) -> TellingSymmetries:
     """Those of the symmetries (S, 4, 4) of a mesh's shape that a small feature tells from the
-    identity; at most ``MAX_SIBLINGS``, far from each other."""
+    identity; at most ``MAX_SIBLINGS``, far from each other, of which each stands for those that are
+    nearest to it."""
     if len(symmetries) == 1:
-        return TellingSymmetries(symmetries)
+        return TellingSymmetries(symmetries, symmetries)
     chosen = spread(symmetries)
     fractions = feature_fractions(mesh, chosen)
-    telling = fractions > FEATURE_FRACTION
-    telling[0] = True
-    return TellingSymmetries(chosen[telling], bool(fractions.max() >= NOTABLE_FRACTION))
+    told = fractions > FEATURE_FRACTION
+    told[0] = False
+    nearest = angles_between(symmetries[:, :3, :3], chosen[:, :3, :3]).argmin(dim=1)
+    telling = told.index_fill(0, torch.tensor([0]), True)
+    notable = bool(fractions.max() >= NOTABLE_FRACTION)
+    return TellingSymmetries(chosen[telling], symmetries[~told[nearest]], notable)
 
 
 def spread(symmetries: Tensor) -> Tensor:
@@ -142,8 +148,18 @@ class Target:
         they are given, and trusted."""
         symmetries = self.symmetries_of(exact=True)
         if self.symmetries is not None or symmetries is None:
-            return TellingSymmetries(torch.eye(4, dtype=torch.float64)[None])
+            one = torch.eye(4, dtype=torch.float64)[None]
+            return TellingSymmetries(one, one)
         return telling_symmetries(self.bank.mesh.surface, symmetries)
+
+    def symmetries_of_answers(self, *, feature_is_hidden: bool) -> Tensor | None:
+        """(S, 4, 4) after which a pose is the same answer: :meth:`symmetries_of` the mesh without
+        those that a small feature tells apart, unless it is not notable and
+        ``feature_is_hidden``."""
+        telling = self.telling_symmetries
+        if len(telling) == 1 or (feature_is_hidden and not telling.notable):
+            return self.symmetries_of(exact=self.is_exact)
+        return telling.others
 
     @cached_property
     def round_axis(self) -> RoundAxis | None:

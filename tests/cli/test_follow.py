@@ -6,6 +6,7 @@ import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import cv2
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.testing import assert_close
 
 from curvireg_torch import data
 from curvireg_torch.cli import following, main
@@ -20,9 +22,10 @@ from curvireg_torch.cli.following import Tally
 from curvireg_torch.data import Photo, Video
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.formats.poses import PoseRecord
-from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.geometry import Camera, camera_matrix, rotation_from_axis_angle
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.jobs.outputs import MARKER
+from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import FailedRegistration, Follower
 from curvireg_torch.visualization import OverlayVideo
 from tests._support import (
@@ -255,6 +258,23 @@ def test_frames_of_another_size_scale_the_camera(frames, follow, tmp_path, kind)
     for row, (_, _, T) in zip(rows[:2], scenes, strict=False):
         check_pose(row, T, 4.0, 0.04)
     assert "turn the photograph by 90 degrees" in rows[2]["message"]
+
+
+def test_a_calibration_without_a_size_is_of_frames_as_large_as_the_first(monkeypatch):
+    """A lens that distorts, in frames of which the second is twice as large."""
+    remove = Mock(wraps=following.undistorted)
+    monkeypatch.setattr(following, "undistorted", remove)
+    monkeypatch.setattr(following, "Follower", Mock())
+    camera = Camera(camera_matrix(60.0, 60.0, 39.5, 29.5), distortion=(-0.3, 0.1, 0.0, 0.0))
+    pixels = torch.arange(80.0).expand(3, 60, 80) / 80.0
+    larger = torch.nn.functional.interpolate(pixels[None], scale_factor=2, mode="bilinear")[0]
+    frames = [(name, Photo(image)) for name, image in (("0.png", pixels), ("1.png", larger))]
+    options = RegisterOptions([Path("0.png")], [], camera=camera)
+    registrar = SimpleNamespace(pipeline=Pipeline())
+    first, second = (image for _, image, _, _ in following._poses(options, registrar, frames))
+    again = torch.nn.functional.avg_pool2d(second[None], 2)[0]
+    assert_close(again[:, 5:-5, 5:-5], first[:, 5:-5, 5:-5], atol=0.01, rtol=0.0)
+    assert [call.args[1].size for call in remove.call_args_list] == [(60, 80)] * 2
 
 
 @pytest.mark.slow

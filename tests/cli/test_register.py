@@ -35,7 +35,7 @@ def test_register_writes_result_and_overlay(registered, tmp_path, capsys):
     assert sum(result["probabilities"]) + result["no_match_probability"] == pytest.approx(1.0)
     printed = capsys.readouterr().out
     assert "viewpoint" in printed
-    assert "standard deviations: " in printed
+    assert "(about and along the camera's axes)" in printed
 
 
 def test_register_is_told_that_a_box_is_that_of_the_visible_part(registered):

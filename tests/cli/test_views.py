@@ -52,6 +52,7 @@ def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, monkeypatch, c
     assert views[0]["camera"]["matrix"][0] == [260.0, 0.0, 119.5]
     printed = capsys.readouterr().out
     assert "row 1: 0.png: prefers the pose by " in printed
+    assert "(about and along the world's axes)" in printed
     assert "row 4: none.png: " in printed
     # All photographs are shown; their cameras stand in the scene.
     assert cv2.imread(str(tmp_path / "overlay.png")).shape[1] == 1600

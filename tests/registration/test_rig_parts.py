@@ -36,7 +36,7 @@ def rig_of(eyes, **attributes):
     rig.eyes = eyes + CENTRE
     rig.describer = SimpleNamespace(centre=CENTRE, radius=RADIUS, hull=None)
     rig.target = SimpleNamespace(pipeline=Pipeline())
-    rig.symmetries = eye(3)[None]
+    rig.symmetries = rig.answer_symmetries = eye(3)[None]
     for name, value in attributes.items():
         setattr(rig, name, value)
     return rig
@@ -79,7 +79,7 @@ def test_candidates_that_are_nearly_equal_count_once():
     rig = rig_of(around(0.0))
     assert rig.distinct(T, score).tolist() == [0, 2, 4, 5]
     assert rig.distinct(T, -score).tolist() == [5, 4, 2, 0]
-    rig.symmetries = torch.stack([eye(4), HALF_TURN])[:, :3, :3]
+    rig.answer_symmetries = torch.stack([eye(4), HALF_TURN])[:, :3, :3]
     assert rig.distinct(T, score).tolist() == [0, 2, 4]
 
 

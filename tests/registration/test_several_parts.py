@@ -53,6 +53,7 @@ class FakeRig:
     exact = True
     describer = SimpleNamespace(hull=None)
     symmetries = eye(3)[None]
+    feature_is_hidden = False
 
     def __init__(self, _, photographs):
         self.photographs = photographs

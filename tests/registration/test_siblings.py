@@ -95,7 +95,7 @@ class Case:
     def run(self, keeps=None):
         """``keeps``: what the limits say, one call after the other."""
         target = target_of(
-            telling_symmetries=TellingSymmetries(self.symmetries),
+            telling_symmetries=TellingSymmetries(self.symmetries, self.symmetries[:1]),
             describer=SimpleNamespace(device_contours=None, centre=zeros(3)),
         )
         answers = iter(keeps or [])

@@ -132,6 +132,57 @@ def test_poses_that_only_a_hidden_feature_tells_apart_are_named(side, notable):
         assert result.confidence > 4 * result.probabilities[1]
 
 
+@cache
+def block_on_top():
+    """A registrar of a box that has a notable block on its top, seen from above and from below."""
+    mesh = box_with_block((24, 24, 14), (75, 0, 47))
+    return exact_registrar(bank_around(mesh, 30, [-50, -35, 35, 50]))
+
+
+def test_a_refined_pose_does_not_gain_by_the_turn_that_looks_the_same():
+    """From both turns of a box whose block is hidden, the answer is as unsure as without a start,
+    and its rival is the other turn."""
+    registrar = block_on_top()
+    image, _, T = photograph_of(registrar.bank.mesh, 30.0, -40.0, 3)
+    about_z = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0])).double()
+    for start in (T, T @ about_z):
+        (result,) = registrar.refine([image], CAMERA, [start])
+        assert rotation_error(result.rotation, start[:3, :3]) < 2.0
+        assert result.confidence <= 0.5
+        assert result.feature_is_hidden
+        first, second = result.probabilities[:2]
+        assert second == pytest.approx(first, rel=0.3)
+        other = result.rotation @ about_z[:3, :3]
+        assert rotation_error(other, result.hypotheses[1].rotation) < 10.0
+        assert result.verdict == "unsure"
+
+
+def joint_answer(registrar, *viewpoints):
+    """The joint answer of photographs from some azimuths and elevations; the world is the model's
+    axes."""
+    shown = [photograph_of(registrar.bank.mesh, *each, int(each[0])) for each in viewpoints]
+    images, boxes, poses = zip(*shown, strict=True)
+    return registrar.register_views(list(images), list(boxes), CAMERA, torch.stack(poses))
+
+
+def test_photographs_of_a_rig_that_show_the_feature_decide():
+    result = joint_answer(block_on_top(), (30.0, -40.0), (75.0, -40.0), (50.0, 40.0))
+    assert rotation_error(result.rotation, eye(3)) < 2.0
+    assert result.reliable
+    assert not result.feature_is_hidden
+    turned = mesh_symmetries(block_on_top().bank.mesh)[1:, :3, :3].double()
+    rivals = torch.stack([each.rotation for each in result.hypotheses[1:]])
+    assert min(rotation_error(turned, R).min() for R in rivals) < 5.0, "it was compared"
+
+
+def test_rig_that_hides_the_feature_is_as_unsure_as_its_photographs():
+    result = joint_answer(block_on_top(), (30.0, -40.0), (75.0, -40.0))
+    assert result.feature_is_hidden
+    assert result.ambiguous is not None
+    assert result.probabilities[1] == pytest.approx(result.probabilities[0], rel=0.3)
+    assert result.confidence <= 0.5
+
+
 def test_given_symmetries_are_trusted():
     bank = registrar_of(marked_box()).bank
     group = mesh_symmetries(marked_box())
@@ -149,6 +200,15 @@ def test_telling_symmetries_are_those_that_a_feature_breaks():
     telling = telling_symmetries(marked_box(), group)
     assert torch.equal(telling.transforms[0], eye(4))
     assert len(telling) == 4
+    assert torch.equal(telling.others, eye(4)[None])
+    on_axis = box_with_block((24, 24, 14), (0, 0, 47))
+    group = mesh_symmetries(on_axis)
+    others = telling_symmetries(on_axis, group).others
+    about_z = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
+    assert rotation_error(others[:, :3, :3], eye(3)).tolist() == pytest.approx([0, 180], abs=1.0)
+    assert rotation_error(others[1, :3, :3], about_z) < 1.0
+    mesh, group = cylinder()
+    assert torch.equal(telling_symmetries(mesh, group).others, group)
 
 
 def test_spread_keeps_few_symmetries_far_apart():
