@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 MAX_LABEL = 127  # of a picture of 8 bits that counts as one of labels: brighter ones are white
 MAX_LISTED = 12  # labels that a message names
+VOID = 255  # index of a palette of labels for pixels that are of none, as borders of PASCAL VOC
 
 
 def mask_file(mask: PathName) -> tuple[Path, int | None]:
@@ -50,12 +51,14 @@ def read_mask(mask: PathName) -> Singles:
     Args:
         mask: ``FILE``, or ``FILE:LABEL`` for the pixels of that value: of the palette's index, of
             grey of 8 or 16 bits. Without a label: an alpha channel that varies is the mask; else
-            the brightest channel; pixels of a single dark value beside 0 are the object.
+            the brightest channel; pixels of a single dark value beside 0, or of a single index of
+            a palette beside 0 and 255, are the object.
 
     Raises:
         MissingFileError: the file does not exist.
         ImageError: it cannot be read.
-        InvalidInputError: no pixel has the label, or several labels are there and none is chosen.
+        InvalidInputError: no pixel has the label, or several labels are there, or labels and white,
+            and none is chosen.
 
     Example:
         >>> import tempfile
@@ -67,10 +70,12 @@ def read_mask(mask: PathName) -> Singles:
     """
     file, label = existing_mask(mask)
     with opened_picture(file) as (image, orientation, _):
-        values, largest = _grey(image)
+        values, largest = _values(image, label is not None)
         values = oriented(as_in_file(values, image, orientation), orientation)
     if label is not None:
         return _labelled(values, label, file)
+    if values.dtype == np.float32:
+        return values
     try:
         return mask_of_values(values, largest)
     except InvalidInputError as error:
@@ -92,18 +97,18 @@ def mask_as_shown(mask: Any, picture: PictureSize) -> Any:
 def mask_of_values(values: Array, largest: int) -> Singles:
     """(H, W) in [0, 1] of a picture's values, of which ``largest`` is white; of a label image, of
     its only label."""
-    if values.size == 0 or int(values.max()) > largest * MAX_LABEL / 255:
+    limit = largest * MAX_LABEL / 255
+    labels = np.unique(values[(values > 0) & (values < largest)])
+    has_white = bool((values == largest).any())
+    if labels.max(initial=0) > limit or (has_white and not labels.size):
         return np.asarray(values / largest, dtype=np.float32)
-    labels = np.unique(values)
-    labels = labels[labels != 0]
-    if len(labels) == 1:
-        return np.asarray(values == labels[0], dtype=np.float32)
-    if len(labels) > 1:
+    if len(labels) > 1 or (has_white and labels.size):
+        white = "white pixels, which may be void, and" if has_white else "no white pixel, but"
         raise InvalidInputError(
-            f"mask: no white pixel, but labels {listed(labels, MAX_LISTED)}; choose one as "
-            "FILE:LABEL, or mask == LABEL"
+            f"mask: {white} labels {listed(labels, MAX_LISTED)}; choose one as FILE:LABEL, or "
+            "mask == LABEL"
         )
-    return np.zeros(values.shape, np.float32)
+    return np.asarray(np.isin(values, labels), dtype=np.float32)
 
 
 def _labelled(values: Array, label: int, file: Path) -> Singles:
@@ -116,17 +121,14 @@ def _labelled(values: Array, label: int, file: Path) -> Singles:
     return np.asarray(chosen, dtype=np.float32)
 
 
-def _grey(image: "Image") -> tuple[Array, int]:
-    """(H, W) values of an open picture, and the value of white."""
-    if image.mode == "P":
-        indices = np.asarray(image)
-        colours = np.asarray(image.convert("RGB")).max(axis=2)
-        is_black_and_white = bool(np.isin(colours, (0, 255)).all()) and len(np.unique(indices)) <= 2
-        return (colours if is_black_and_white else indices), 255
-    if image.has_transparency_data:
+def _values(image: "Image", is_of_labels: bool) -> tuple[Array, int]:
+    """(H, W) values of an open picture, and the value of white; float32 of transparency."""
+    if image.has_transparency_data and not is_of_labels:
         alpha = np.asarray(image.convert("RGBA"))[..., 3]
         if alpha.min() != alpha.max():
-            return alpha, 255
+            return np.asarray(alpha / 255, dtype=np.float32), 1
+    if image.mode == "P":
+        return (np.asarray(image), 255) if is_of_labels else _of_palette(image)
     if image.mode == "1":
         return np.asarray(image).astype(np.uint8), 1
     if image.mode == "I" or image.mode.startswith("I;16"):
@@ -134,3 +136,16 @@ def _grey(image: "Image") -> tuple[Array, int]:
     if image.mode == "F":
         raise ImageError("mask: expected whole numbers, got floating values; save it as PNG")
     return np.asarray(image.convert("RGB")).max(axis=2), 255
+
+
+def _of_palette(image: "Image") -> tuple[Array, int]:
+    """Brightness where a palette is that of grey, or black and white; else its indices, none of
+    which is white."""
+    indices = np.asarray(image)
+    colours = np.asarray(image.convert("RGB"))
+    brightest = colours.max(axis=2)
+    is_black_and_white = bool(np.isin(brightest, (0, 255)).all()) and len(np.unique(indices)) <= 2
+    if is_black_and_white or bool((colours == indices[..., None]).all()):
+        return brightest, 255
+    labels = np.where(indices == VOID, 0, indices)
+    return (labels if labels.any() else indices), 65535

@@ -79,11 +79,44 @@ def test_palettes_are_labels_unless_they_are_black_and_white(tmp_path):
     check(tmp_path / "inverse.png")
 
 
+def test_void_of_label_images_is_neither_white_nor_the_object(tmp_path):
+    labels = np.zeros((20, 30), np.uint8)
+    labels[3:15, 5:25] = 255
+    labels[OBJECT] = 1
+    picture = Image.fromarray(labels, "P")
+    picture.putpalette([0, 0, 0, 255, 0, 0, *[128] * 753, 224, 224, 192])
+    picture.save(tmp_path / "void.png")
+    check(tmp_path / "void.png")
+    check(f"{tmp_path / 'void.png'}:1")
+    with refused("white pixels, which may be void, and labels 1; choose one as FILE:LABEL"):
+        read_mask(written(tmp_path / "grey.png", labels))
+    check(f"{tmp_path / 'grey.png'}:1")
+    labels[0] = 200
+    picture.frombytes(labels.tobytes())
+    picture.save(tmp_path / "two.png")
+    with refused("no white pixel, but labels 1, 200"):
+        read_mask(tmp_path / "two.png")
+
+
+def test_a_label_of_a_pure_colour_is_chosen_by_its_index(tmp_path):
+    picture = Image.fromarray(OBJECT.astype(np.uint8), "P")
+    picture.putpalette([0, 0, 0, 255, 0, 0])
+    picture.save(tmp_path / "red.png")
+    check(tmp_path / "red.png")
+    check(f"{tmp_path / 'red.png'}:1")
+
+
 def test_transparency_that_varies_is_the_mask(tmp_path):
     picture = np.random.default_rng(0).integers(0, 255, (20, 30, 4), dtype=np.uint8)
     picture[..., 3] = 255 * OBJECT
     file = written(tmp_path / "cut.png", picture)
     check(file)
+    few = Image.fromarray(picture).quantize(64, method=Image.Quantize.FASTOCTREE)
+    few.save(tmp_path / "palette.png")
+    check(tmp_path / "palette.png")
+    picture[0, 0, 3] = 60  # no label
+    found = read_mask(written(tmp_path / "soft.png", picture))
+    assert np.allclose(found, picture[..., 3] / 255)
     picture[...] = 255 * OBJECT[..., None]
     picture[..., 3] = 255
     check(written(tmp_path / "opaque.png", picture))
