@@ -22,7 +22,9 @@ _MATRIX_NAMES = """
     transform_matrix ob_in_cam K
 """
 # frames of ROS in which no camera looks along z: the world's, and bodies, whose x points forward
-_OTHER_FRAMES = re.compile(r"(^|/)(world|map|odom|base\w*|earth|\w*_link)$")
+_OTHER_FRAMES = re.compile(
+    r"(^|/)((\w+_)?(world|map|odom|earth|link\d*|tool\d*)|base\w*|\w+_frame)$"
+)
 FORMATS = (
     "JSON with rotation and translation, or T_cam_from_model; 4 x 4 numbers; TWO of MegaPose; "
     "scene_gt.json:IMAGE_ID of BOP; pose.yaml of ROS"
@@ -119,20 +121,23 @@ def _item(items: Sequence[Any], name: str, mesh: str) -> Any:
     number = re.search(r"obj_(\d+)$", mesh)
     fields = [item if isinstance(item, dict) else {} for item in items]
     labels = [str(item.get("label", "")) for item in fields]
+    objects = [item.get("obj_id") for item in fields]
+    of_object = ""
     if name and name not in labels:
         chosen = [int(name)] if name.isdecimal() and int(name) < len(items) else []
     elif name:
         chosen = [k for k, label in enumerate(labels) if label == name]
-    elif len(items) > 1 and number:
-        chosen = [k for k, item in enumerate(fields) if item.get("obj_id") == int(number[1])]
+    elif number and None not in objects:
+        of_object = f" of object {int(number[1])}"
+        chosen = [k for k, one in enumerate(objects) if one == int(number[1])]
     else:
         own = [k for k, label in enumerate(labels) if label and label == mesh]
         chosen = own or [*range(len(items))]
     if len(chosen) != 1:
         names = listed(label or index for index, label in enumerate(labels))
         raise InvalidInputError(
-            f"expected one pose, got {len(chosen)} of {len(items)}; choose one as FILE:NAME: "
-            f"{names}"
+            f"expected one pose{of_object}, got {len(chosen)} of {len(items)}; choose one as "
+            f"FILE:NAME: {names}"
         )
     return items[chosen[0]]
 
@@ -221,7 +226,7 @@ def _ros(record: Record) -> PoseRecord:
     """A PoseStamped, as ``--format ros`` writes it: metres, in the camera's optical frame."""
     header = record.inside("header")
     frame = str((header and header.get("frame_id")) or "")
-    if _OTHER_FRAMES.search(frame):
+    if "optical" not in frame and _OTHER_FRAMES.search(frame):
         raise InvalidInputError(
             f"frame_id {frame!r:.60} is not the camera's optical frame (x right, y down, z "
             f"forward); transform the pose into that, as tf2 does"

@@ -98,9 +98,12 @@ def test_bop_writes_millimetres_and_several_objects(read):
     check(read(truth, "12:1"), "mm")
     with refused("poses of several images; choose one as FILE:IMAGE_ID from 3, 12"):
         read(truth)
-    with refused("expected one pose, got 2 of 2"):
+    with refused("expected one pose of object 5, got 2 of 2"):
         read(truth, "12", mesh="obj_000005")
     check(read({"7": [entry(1, R)]}), "mm")
+    with refused("expected one pose of object 7, got 0 of 1; choose one as FILE:NAME: 0"):
+        read({"7": [entry(1, R)]}, mesh="obj_000007")
+    check(read({"7": [entry(1, R)]}, "7:0", mesh="obj_000007"), "mm")
     check(read(entry(1, R)), "mm")
 
 

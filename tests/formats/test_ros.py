@@ -72,10 +72,15 @@ FRAMES = """
 camera_optical_frame | true
 cam: 1               | true
 linked               | true
+camera_optical_link  | true
 world                | false
 robot/map            | false
 camera_link          | false
 base_footprint       | false
+camera_color_frame   | false
+odom_frame           | false
+panda_link0          | false
+tool0                | false
 """
 
 
