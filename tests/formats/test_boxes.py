@@ -96,8 +96,20 @@ YOLO = """
     "corners", ["0.1 0.2 0.5 0.9 0.9 1", "0.1 0.2 0.3 0.2 0.3 0.3 0.3 0.4 0.9 1"]
 )
 def test_a_polygon_that_ends_on_the_border_is_none_of_a_tracker(write, corners):
-    (box,) = read_boxes(write("a.txt", f"0 {corners}"))
+    box, _ = read_boxes(write("a.txt", f"0 {corners}\n0 0.1 0.1 0.1 0.2 0.2 0.2 0.2 0.1"))
     assert (box.corners, box.track) == ((0.1, 0.2, 0.9, 1.0), "")
+
+
+def test_a_polygon_may_end_with_the_number_1_of_a_tracker(write):
+    outline = "0 0.1 0.2 0.3 0.2 0.3 0.3 0.3 0.4 0.1 0.4"
+    box, _ = read_boxes(write("a.txt", f"{outline} 0.9 1\n{outline} 0.8 2"))
+    assert (box.corners, box.score, box.track) == ((0.1, 0.2, 0.3, 0.4), 0.9, "1")
+    with refused("line 1: ends with a corner on the border, or with a score and the tracker's num"):
+        read_boxes(write("a.txt", f"{outline} 0.9 1"))
+    (box,) = read_boxes(write("a.txt", f"{outline} 0.3 0.995 0.2 1"))
+    assert box.corners == (0.1, 0.2, 0.3, 1.0), "either way"
+    (box,) = read_boxes(write("a.txt", "0 0.25 0.75 0.5 0.5 0.75 0.75 0.5 1"))
+    assert box.corners == (0.25, 0.5, 0.75, 1.0), "an oriented box"
 
 
 @pytest.mark.parametrize(("line", "score", "track", "kind"), text_table(YOLO))
@@ -173,6 +185,22 @@ def test_annotations_of_coco_name_images_and_categories(write):
     assert box_of(f"{file}:can", "shots/000012.png") == BOX
     with refused("no box of label 'box'"):
         box_of(f"{file}:box", "shots/000012.png")
+
+
+def test_rectangles_that_are_turned_lie_in_their_box(write):
+    """As CVAT writes them: side lengths, and an angle about the middle."""
+    turned = item("a.png", 1.0, (20, 8, 24, 32), attributes={"rotation": 90.0})
+    assert box_of(write("boxes.json", [turned]), "a.png") == pytest.approx(BOX)
+    turned["attributes"] = {"rotation": -30.0, "occluded": False}
+    x0, y0, x1, y1 = box_of(write("boxes.json", [turned]), "a.png")
+    sides = 12 * 3**0.5 + 16, 12 + 16 * 3**0.5
+    assert (x1 - x0, y1 - y0, x0 + x1, y0 + y1) == pytest.approx((*sides, 63, 47))
+    rotation = (
+        "<attributes><attribute><name>rotation</name><value>90</value></attribute></attributes>"
+    )
+    voc = VOC.replace("<name>can</name>", f"<name>can</name>{rotation}")
+    found = box_of(f"{write('photo.xml', voc)}:can", "shots/photo.jpg")
+    assert found == pytest.approx((19.5, 7.5, 43.5, 39.5))
 
 
 def test_photographs_of_one_name_are_told_apart_by_their_folders(write):
@@ -293,6 +321,7 @@ LABELME = {
         {"label": "can", "points": [[48, 36], [16, 12]], "shape_type": "rectangle"},
         {"label": "box", "points": [[1, 1], [9, 1], [9, 9], [1, 9]], "shape_type": "polygon"},
         {"label": "eye", "points": [[5, 5], [5, 9]], "shape_type": "circle"},
+        {"label": "tip", "points": [[5, 5]], "shape_type": "point"},
     ],
     "imagePath": "..\\shots\\photo.jpg",
     "imageHeight": 48,
@@ -346,7 +375,6 @@ NO_BOXES = """
 {"a": 1}                                    | expected detections of COCO, or annotations of LabelMe
 [{"image_id": 1}]                           | entry 0: expected bbox of 4 numbers
 {"shapes": [{"points": [[1, 2], [3]]}]}     | shape 0: expected points x, y
-{"shapes": [{"points": [[1, 2]]}]}          | shape 0: expected points x, y
 <svg/>                                      | expected <annotation> of Pascal VOC
 <annotation><object/></annotation>          | object 0: expected <bndbox> of xmin
 <annotation>                                | damaged, or no XML that is read

@@ -28,6 +28,9 @@ ID_LABEL = "id="
 BEYOND = 0.05
 """Fraction of a picture by which a tracker's box may leave it."""
 
+NEAR = 0.01
+"""Fraction of a picture by which a box may be larger for a corner that may be none."""
+
 Corners = tuple[float, float, float, float]
 
 
@@ -94,7 +97,8 @@ def _refused(what: str) -> InvalidInputError:
 
 def _yolo(text: str) -> Iterator[ImageBox]:
     """Lines of CLASS and numbers: a box, an oriented box or a polygon, behind which a score and a
-    tracker's number may stand."""
+    tracker's number may stand: behind all lines of a file, or none."""
+    rows: list[tuple[int, str, tuple[float, ...]]] = []
     for count, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words:
@@ -103,30 +107,44 @@ def _yolo(text: str) -> Iterator[ImageBox]:
             numbers = tuple(map(float, words[1:]))
         except ValueError:
             numbers = ()
-        box = _yolo_box(numbers) if all(map(math.isfinite, numbers)) else None
-        if box is None:
+        if len(numbers) < 4 or not all(map(math.isfinite, numbers)):
             expected = "CLASS CX CY WIDTH HEIGHT [SCORE], or CLASS X0 Y0 X1 Y1 X2 Y2 ..., of YOLO"
             raise _refused(f"line {count}: expected {expected}")
-        yield replace(box, labels=frozenset(words[:1]))
+        rows.append((count, words[0], numbers))
+    ends = [numbers[-1] for *_, numbers in rows]
+    are_tracks = {end > 1.0 and end == int(end) for end in ends if end != 1.0}
+    has_tracks = are_tracks.pop() if len(are_tracks) == 1 else None
+    for count, label, numbers in rows:
+        box = _yolo_box(numbers, has_tracks)
+        if box is None:
+            raise InvalidInputError(
+                f"line {count}: ends with a corner on the border, or with a score and the "
+                "tracker's number 1; begin it with another corner, or leave the number out"
+            )
+        yield replace(box, labels=frozenset((label,)))
 
 
-def _yolo_box(numbers: Sequence[float]) -> ImageBox | None:
-    """The box of the numbers of a line; None if there are too few."""
+def _yolo_box(numbers: Sequence[float], has_tracks: bool | None) -> ImageBox | None:
+    """The box of the numbers of a line of a file whose other lines end with a tracker's number, or
+    not; None if it depends on that, which they do not show."""
     count = len(numbers)
-    if count < 4:
-        return None
     x, y, width, height, *more = numbers
     corners = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
     is_whole = numbers[-1] >= 1.0 and numbers[-1] == int(numbers[-1])
     # outside, six numbers are the corners of a triangle, the last of which lies on the border
     is_inside = min(corners) > -BEYOND and max(corners) < 1.0 + BEYOND
     is_box = count < 6 or (count == 6 and is_whole and is_inside)
-    # an even number that ends with 1 is a polygon down to the border, not a score and a track,
-    # unless it begins with the corners of an oriented box
-    is_oriented = count == 10 and all(
+    # an even number that ends with 1 is a polygon down to the border, or ends with a score and a
+    # track; the corners of an oriented box tell
+    is_oriented = count in (8, 10) and all(
         abs(numbers[k] - numbers[k + 2] + numbers[k + 4] - numbers[k + 6]) < 1e-3 for k in (0, 1)
     )
-    is_polygon = count % 2 == 0 and numbers[-1] == 1.0 and not is_oriented
+    is_open = count > 6 and count % 2 == 0 and numbers[-1] == 1.0
+    if is_open and not is_oriented and has_tracks is None:
+        outer, inner = _around(numbers), _around(numbers[:-2])
+        if max(abs(a - b) for a, b in zip(outer, inner, strict=True)) > NEAR:
+            return None
+    is_polygon = is_open and (count == 8 if is_oriented else not has_tracks)
     is_track = count > 4 if is_box else count > 6 and not is_polygon
     has_track = is_whole and is_track
     ending = more if is_box else list(numbers)
@@ -165,7 +183,10 @@ def _labelme(content: Document) -> Iterator[ImageBox]:
     size = _size(content.get("imageHeight"), content.get("imageWidth"))
     image = str(content.get("imagePath") or "")
     for index, shape in enumerate(content["shapes"]):
-        numbers = _numbers_of_points(shape.get("points") if isinstance(shape, dict) else None)
+        points = shape.get("points") if isinstance(shape, dict) else None
+        if isinstance(points, list) and len(points) < 2:
+            continue  # a mark, around which there is no box
+        numbers = _numbers_of_points(points)
         if len(numbers) < 4:
             raise _refused(f"shape {index}: expected points x, y")
         corners = _around(numbers)
@@ -201,7 +222,9 @@ def _coco(content: Document) -> Iterator[ImageBox]:
         if numbers is None:
             raise _refused(f"entry {index}: expected bbox of 4 numbers")
         x, y, c, d = numbers
-        corners = (x, y, x + c, y + d)
+        attributes = fields.get("attributes")
+        turn = attributes.get("rotation") if isinstance(attributes, dict) else None
+        corners = _turned((x, y, x + c, y + d), turn)
         if is_corners:
             corners = (x + PIXEL_CENTRE, y + PIXEL_CENTRE, c + PIXEL_CENTRE, d + PIXEL_CENTRE)
         score = finite_numbers([fields.get("score", 1.0)], 1) or (0.0,)
@@ -215,6 +238,19 @@ def _coco(content: Document) -> Iterator[ImageBox]:
             file_name = f"{scene}/{ANY_FOLDER}/{file_name}"
         size = _size(image.get("height"), image.get("width"))
         yield ImageBox(corners, image=file_name, size=size, score=score[0], labels=labels)
+
+
+def _turned(corners: Sequence[float], degrees: Any) -> Corners:
+    """The corners around a rectangle that is turned about its middle, as CVAT writes it."""
+    x0, y0, x1, y1 = corners
+    (turn,) = finite_numbers([degrees], 1) or (0.0,)
+    if turn == 0.0:
+        return x0, y0, x1, y1
+    cosine, sine = abs(math.cos(math.radians(turn))), abs(math.sin(math.radians(turn)))
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    width = (x1 - x0) * cosine + (y1 - y0) * sine
+    height = (x1 - x0) * sine + (y1 - y0) * cosine
+    return x - width / 2, y - height / 2, x + width / 2, y + height / 2
 
 
 def _by_id(entries: Any) -> dict[str, Document]:
@@ -263,10 +299,14 @@ def _voc(root: ElementTree.Element) -> Iterator[ImageBox]:
         corners = finite_numbers(sides, 4)
         if corners is None:
             raise _refused(f"object {index}: expected <bndbox> of xmin, ymin, xmax, ymax")
-        x0, y0, x1, y1 = corners
+        attributes = {
+            one.findtext("name", "").strip(): _number(one, "value")
+            for one in item.iter("attribute")
+        }
+        box = _turned(corners, attributes.get("rotation"))
         name = f"{folder}/{image}" if folder and image else image
         labels = _labels(item.findtext("name", "").strip())
-        yield ImageBox((x0, y0, x1, y1), image=name, size=size, labels=labels)
+        yield ImageBox(box, image=name, size=size, labels=labels)
 
 
 def _number(element: ElementTree.Element, path: str) -> float | None:
