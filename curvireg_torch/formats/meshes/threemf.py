@@ -12,6 +12,7 @@ from array import array
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from io import BytesIO
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -37,7 +38,13 @@ _MOST = {
 }
 """Entries of one model part of the package; of objects, items and groups so many as parts."""
 
-_SUPPORTS = ("solidsupport", "support")  # Types of objects
+_SUPPORT_TEXT = "supports of the print are left out"
+_MODIFIER_TEXT = "parts that change the print, such as modifiers and negative parts, are left out"
+_NO_SOLIDS = {"solidsupport": _SUPPORT_TEXT, "support": _SUPPORT_TEXT, "other": _MODIFIER_TEXT}
+"""Types of objects that are no material of the printed part, and what is said of them."""
+
+_SETTINGS = ("metadata/model_settings.config", "metadata/slic3r_pe_model.config")
+"""Of Bambu Studio and OrcaSlicer, which has parts of objects; of PrusaSlicer, ranges of faces."""
 
 Attributes = dict[str, str]
 Item = tuple[str, str, str]
@@ -101,6 +108,7 @@ def read_threemf(source: MeshSource) -> ReadMesh:
         ) from error
     root = package.root()
     model = package.model(root)
+    package.leave_out_modifiers(model)
     parts = []
     for path, name, transform in package.items(root):
         parts += package.parts(path, name, _matrix(transform), 0)
@@ -148,6 +156,21 @@ class _Package:
             self._models[path] = model
         return self._models[path]
 
+    def leave_out_modifiers(self, model: _Model) -> None:
+        """Take out of the first model what the settings of slicers say is no material."""
+        for name in filter(self._names.__contains__, _SETTINGS):
+            for given in read_xml(self._content(name)).iter("object"):
+                one = model.objects.get(given.get("id", ""))
+                if one is not None and _leave_out(one, given):
+                    self._source.warn("parts", _MODIFIER_TEXT)
+
+    def _is_no_solid(self, path: str, name: str) -> bool:
+        known = self.model(path).objects.get(name)
+        text = _NO_SOLIDS.get(known.kind) if known else None
+        if text is not None:
+            self._source.warn("parts", text)
+        return text is not None
+
     def items(self, root: str) -> list[Item]:
         """What of the build is the object itself: no supports, nothing that is not printed, and of
         copies on the plate the first."""
@@ -155,10 +178,9 @@ class _Package:
         copies = 0
         for given, name, transform in self.model(root).items:
             path = given or root
-            known = self.model(path).objects.get(name)
-            if known is not None and known.kind in _SUPPORTS:
-                self._source.warn("parts", "supports of the print are left out")
-            elif (path, name) in items:
+            if self._is_no_solid(path, name):
+                continue
+            if (path, name) in items:
                 copies += 1
             else:
                 items[path, name] = path, name, transform
@@ -187,7 +209,8 @@ class _Package:
             check_faces(self._faces)
             found.append(mesh.transformed(place))
         for other, child, transform in one.components:
-            found += self.parts(other or path, child, place @ _matrix(transform), depth + 1)
+            if not self._is_no_solid(other or path, child):
+                found += self.parts(other or path, child, place @ _matrix(transform), depth + 1)
         return found
 
     def _mesh(self, path: str, name: str, one: _Object) -> ReadMesh:
@@ -245,6 +268,31 @@ class _Package:
         if self._bytes_left < 0:
             raise ValueError(f"it unpacks to more than {MAX_MESH_BYTES:,} bytes")
         return content
+
+
+def _leave_out(one: _Object, settings: Element) -> bool:
+    """Remove the parts of an object that are no material, by the settings of its slicer; whether
+    there are any."""
+    count = len(one.components) + len(one.properties)
+    kinds = {part.get("id"): part.get("subtype", "normal_part") for part in settings.iter("part")}
+    one.components = [
+        item for item in one.components if kinds.get(item[1], "normal_part") == "normal_part"
+    ]
+    volumes = [
+        (int(volume.get("firstid", "")), int(volume.get("lastid", "")))
+        for volume in settings.iter("volume")
+        if not _is_solid(volume)
+    ]
+    for first, last in sorted(volumes, reverse=True):
+        del one.triangles[3 * first : 3 * (last + 1)]
+        del one.properties[first : last + 1]
+    return len(one.components) + len(one.properties) < count
+
+
+def _is_solid(volume: Element) -> bool:
+    """Whether a range of faces of PrusaSlicer is material; earlier versions say ``modifier``."""
+    values = {entry.get("key"): entry.get("value") for entry in volume.iter("metadata")}
+    return values.get("volume_type", "ModelPart") == "ModelPart" and values.get("modifier") != "1"
 
 
 def _matrix(text: str) -> Floats:

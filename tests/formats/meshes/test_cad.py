@@ -312,6 +312,36 @@ def test_threemf_leaves_out_what_is_not_the_object(read_3mf):
     assert "2 objects on its build plate are read as one rigid body" in texts[0]
 
 
+def test_threemf_leaves_out_modifiers_of_slicers(read_3mf):
+    """By the type of their object; by the settings of Bambu Studio; by those of PrusaSlicer."""
+    said = "parts that change the print, such as modifiers and negative parts, are left out"
+    parts = '<component objectid="1"/><component objectid="2"/>'
+    whole = f'<object id="3"><components>{parts}</components></object>'
+    other = solid(2, shape=SMALL).replace('type="model"', 'type="other"')
+    bambu = (
+        '<config><object id="3"><part id="1" subtype="normal_part"/>'
+        '<part id="2" subtype="negative_part"/></object></config>'
+    )
+    joined = solid(1, shape=trimesh.util.concatenate([SMALL, BOX]))
+    prusa = (
+        '<config><object id="1"><volume firstid="0" lastid="11"><metadata type="volume" '
+        'key="{}" value="{}"/></volume><volume firstid="12" lastid="23"><metadata type="volume" '
+        'key="volume_type" value="ModelPart"/></volume></object></config>'
+    )
+    for resources, number, settings in (
+        (solid(1) + other + whole, 3, {}),
+        (solid(1) + solid(2, shape=SMALL) + whole, 3, {"model_settings.config": bambu}),
+        *(
+            (joined, 1, {"Slic3r_PE_model.config": prusa.format(key, value)})
+            for key, value in (("volume_type", "SupportBlocker"), ("modifier", "1"))
+        ),
+    ):
+        more = {f"Metadata/{name}": content for name, content in settings.items()}
+        mesh, texts = read_3mf(resources, f'<item objectid="{number}"/>', more=more)
+        assert (len(mesh.faces), mesh.extents.tolist()) == (12, [30.0, 20.0, 10.0])
+        assert [text.partition(": ")[2] for text in texts] == [said]
+
+
 def test_threemf_reads_colours_and_textures(read_3mf):
     base = (
         '<basematerials id="5"><base name="a" displaycolor="#FF0000"/><base name="b" '
