@@ -142,12 +142,14 @@ def read_mesh(mesh: Any, key: str, arrays: Fields) -> Fields | None:
     arrays[key + "points"] = points[used]
     arrays[key + "counts"] = counts
     arrays[key + "indices"] = own.reshape(-1)
-    colour = _by_corner(UsdGeom.Gprim(mesh).GetDisplayColorPrimvar(), counts, indices)
+    prim = mesh.GetPrim()
+    primvars = UsdGeom.PrimvarsAPI(prim)
+    shown = primvars.FindPrimvarWithInheritance("displayColor")
+    colour = _by_corner(shown, counts, indices)
     if colour is not None:
         arrays[key + "colour"] = colour.reshape(-1, 3)
     materials: list[Fields] = []
     of_face = np.zeros(len(counts), np.int64)
-    prim = mesh.GetPrim()
     subsets = UsdGeom.Subset.GetAllGeomSubsets(mesh)
     bound = [(one.GetPrim(), _array(one.GetIndicesAttr())) for one in subsets]
     for owner, faces in [(prim, np.arange(len(counts))), *bound]:
@@ -157,8 +159,7 @@ def read_mesh(mesh: Any, key: str, arrays: Fields) -> Fields | None:
         surface = _surface_of(material)
         uv = None
         if name := surface.get("coordinates"):
-            primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
-            uv = _by_corner(primvar, counts, indices)
+            uv = _by_corner(primvars.FindPrimvarWithInheritance(name), counts, indices)
         if uv is None:
             surface.pop("texture", None)
         else:
@@ -206,11 +207,11 @@ def _surface_of(material: Any) -> Fields:
         entry = shader.GetInput(name)
         if not entry:
             continue
+        value = _first_value(value_of(entry))
+        if value is not None:
+            return {"colour": [float(v) for v in value][:3]}
         source = entry.GetConnectedSources()[0]
-        if source:
-            return texture_of(UsdShade.Shader(source[0].source.GetPrim()))
-        value = entry.Get()
-        return {} if value is None else {"colour": [float(v) for v in value][:3]}
+        return texture_of(UsdShade.Shader(source[0].source.GetPrim())) if source else {}
     return {}
 
 

@@ -122,6 +122,17 @@ def test_colours_of_the_mesh(read_usd):
     mesh, _ = read_usd(square(more, counts="3, 3", indices="0, 1, 2, 0, 2, 3"))
     assert mesh.colours.corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
     assert mesh.has_colours
+    mesh, _ = read_usd(square(), place="    color3f[] primvars:displayColor = [(0, 0, 1)]\n")
+    assert mesh.colours.corners[0, 0].tolist() == [0, 0, 255], "of the group"
+
+
+def test_a_colour_that_is_an_input_of_the_material(read_usd):
+    named = MATERIAL.replace("paint/print.outputs:rgb", "paint.inputs:colour")
+    surface = "        token outputs:surface.connect"
+    named = named.replace(surface, f"        color3f inputs:colour = (0, 1, 0)\n{surface}", 1)
+    mesh, texts = read_usd(named, square(MAP, BOUND))
+    assert not texts
+    assert mesh.colours.corners[0, 0].tolist() == [0, 255, 0]
 
 
 def test_textures_by_the_coordinates_that_they_name(tmp_path, read_usd, load):
