@@ -28,6 +28,7 @@ from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import (
     Follower,
     block,
+    doubts,
     hypotheses,
     several,
     stages,
@@ -308,7 +309,7 @@ def test_a_pose_beside_its_mask_is_not_believed(monkeypatch, changed, is_beside)
     monkeypatch.setattr(stages, "register_boxes", lambda _, items: [sure] * len(items))
     item = as_photograph(IMAGE, BOX, CAMERA, mask=mask)
     (result,) = stages.register_photographs(truck_registrar(), [item])
-    assert (stages.BESIDE_MASK in result.warnings) == is_beside
+    assert (doubts.BESIDE_MASK in result.warnings) == is_beside
     assert result.reliable != is_beside
     monkeypatch.setattr(Registrar, "is_exact", False)
     (similar,) = stages.register_photographs(truck_registrar(), [item])
@@ -331,7 +332,7 @@ def test_a_pose_beside_its_box_is_not_believed(monkeypatch, moved, is_beside):
     sure = replace(truck_answer(), probabilities=(1.0,))
     box = BOX + torch.tensor(moved) * (BOX[2:] - BOX[:2]).repeat(2)
     result, _ = registered_in_boxes(monkeypatch, *[sure] * 4, box=box)
-    assert (stages.BESIDE_BOX in result.warnings) == is_beside
+    assert (doubts.BESIDE_BOX in result.warnings) == is_beside
     assert result.reliable != is_beside
 
 
