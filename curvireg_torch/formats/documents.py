@@ -63,12 +63,15 @@ def read_document(file: Path, expected: str = EXPECTED) -> Any:
         if _TOML.match(text):
             return _toml(text, expected)
         if start and start in "{[" and file.suffix.lower() not in (".yaml", ".yml"):
-            return json.loads(text)
+            return json.loads(re.sub(r"(?m)^\s*//.*", "", text))  # comments of OpenCV
         if start == "<":
             root = read_xml(data)
             return {root.tag: _element(root)}
     except (ValueError, RecursionError) as error:
-        raise InvalidInputError(f"damaged, or no calibration ({error}); write it again") from error
+        advice = "write it again"
+        if isinstance(error, json.JSONDecodeError) and error.msg == "Extra data":
+            advice = "write one of its JSON values as a file"
+        raise InvalidInputError(f"damaged ({error}); {advice}; expected {expected}") from error
     return _colmap(text) if _COLMAP_LINE.search(text) else _yaml(text, expected)
 
 
@@ -120,14 +123,19 @@ def _arrays(data: bytes) -> Fields:
 
 
 def _array(data: bytes) -> Any:
-    """The values of a file of ``numpy.save``; None of objects, which are not loaded, and texts."""
+    """The values of a file of ``numpy.save``: numbers, bools, a text; None of objects, which are
+    not loaded, and of lists of texts."""
     try:
         array = np.load(BytesIO(data), allow_pickle=False)
     except ValueError as error:
         if "allow_pickle" in str(error):
             return None
         raise
-    return array.astype(np.float64).tolist() if array.dtype.kind in "fiu" else None
+    if array.dtype.kind in "fiu":
+        array = array.astype(np.float64)
+    elif array.dtype.kind != "b" and not (array.dtype.kind == "U" and array.ndim == 0):
+        return None
+    return array.tolist()
 
 
 def _colmap(text: str) -> Fields:

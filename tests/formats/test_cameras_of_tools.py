@@ -143,6 +143,29 @@ JSON = {
     ),
     "DepthAI": ({"K": MATRIX, "distortionCoeff": BENT, "cameraType": 0}, BENT, None),
     "realsense by number": ({**REALSENSE, "coeffs": BENT, "model": 4}, BENT, VGA),
+    "realsense by a float": ({**REALSENSE, "coeffs": BENT, "model": 4.0}, BENT, VGA),
+    "named like our model": (
+        {"matrix": MATRIX, "model": "radial-tangential", "dist": BENT, **SIZE},
+        BENT,
+        VGA,
+    ),
+    "two coefficients": ({"K": MATRIX, "dist": [-0.31, 0.12]}, (-0.31, 0.12, 0.0, 0.0), None),
+    "rational": (
+        {**FLAT, "k1": -0.31, "k2": 0.12, "k4": 0.1, "distortion_model": "rational_polynomial"},
+        (-0.31, 0.12, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0),
+        None,
+    ),
+    "stereo rectified": ({"K": MATRIX, "D": BENT, "P1": [MATRIX[0] + [0.0]] * 3}, BENT, None),
+    "metashape's covariance": (
+        {"K": MATRIX, "D": BENT, "covariance": {"coeffs": [0.5, 0.1]}},
+        BENT,
+        None,
+    ),
+    "numbers of coefficients": (
+        {"K": MATRIX, "D": BENT, "NumRadialDistortionCoefficients": 2},
+        BENT,
+        None,
+    ),
 }
 
 
@@ -176,6 +199,12 @@ REFUSED = [
         "INVERSE_BROWN_CONRADY' is not supported",
     ),
     ({**REALSENSE, "coeffs": BENT, "model": 2}, "'inversebrown' is not supported"),
+    ({**REALSENSE, "coeffs": BENT, "model": 2.0}, "'inversebrown' is not supported"),
+    ({"camera_type": "ds", "intrinsics": {**FLAT, "alpha": 0.6}}, "'ds' is not supported"),
+    ({"camera_type": "ucm", "intrinsics": {**FLAT, "alpha": 0.6}}, "'ucm' is not supported"),
+    ({"K": MATRIX, "xi": 0.9}, "'xi': looks like distortion"),
+    ({"K": MATRIX, "D": BENT, "P1": [0.1, 0.2]}, "'P1': looks like distortion"),
+    ({**FLAT, "k1": 0.1, "k2": 0.1, "k3": 0.1, "k4": 0.1}, "k1 to k4 without p1 and p2"),
     ({"K": MATRIX, "distortionCoeff": BENT, "cameraType": 3}, "'division' is not supported"),
 ]
 FOREIGN = r"""
@@ -218,6 +247,31 @@ def test_a_fisheye_may_have_room_for_more_coefficients(read, key, model, room):
     check_camera(read(content), tuple(lens), VGA, model="fisheye")
     with refused("expected 4 finite coefficients"):
         read({**content, name: [*lens, *[0.5] * (room - 4)]})
+
+
+def test_the_fisheye_of_basalt(read):
+    lens = {"k1": 0.02, "k2": -0.01, "k3": 0.003, "k4": -0.001}
+    inside = {"camera_type": "kb4", "intrinsics": {**FLAT, **lens}}
+    camera = read({"value0": {"intrinsics": [inside], "resolution": [[640, 480]]}})
+    check_camera(camera, tuple(lens.values()), VGA, model="fisheye")
+
+
+def test_a_crop_keeps_the_order_of_a_size(read):
+    """Its principal point is nearer to the centre of the turned picture."""
+    K = [[520.5, 0.0, 200.0], [0.0, 522.0, 350.0], [0.0, 0.0, 1.0]]
+    assert read({"matrix": K, "size": [640, 480]}).size == VGA
+
+
+def test_comments_that_opencv_writes_into_json(write):
+    text = f'{{\n    // flags: +fix_k3\n    "camera_matrix": {MATRIX}}}'
+    check_camera(load_camera(write("a.json", text)), (), None)
+
+
+@pytest.mark.parametrize("key", [{"fisheye": True}, {"distortion_model": "fisheye"}])
+def test_the_model_in_arrays_of_numpy(tmp_path, key):
+    lens = (0.02, -0.01, 0.003, -0.001)
+    np.savez(tmp_path / "a.npz", K=K, D=lens, **key)
+    check_camera(load_camera(tmp_path / "a.npz"), lens, None, model="fisheye")
 
 
 OPENSFM = {

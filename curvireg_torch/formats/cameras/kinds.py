@@ -58,6 +58,11 @@ SIZES = _names("""
     resolution image_size img_size image_resolution size image_shape img_shape image_dimensions imsize frame_size
     dim img_dim intrinsic_matrix_reference_dimensions
 """)  # noqa: E501
+SHAPES = _names("""
+    resolution image_resolution image_shape img_shape image_dimensions intrinsic_matrix_reference_dimensions
+""")  # noqa: E501
+"""Those of pairs that may be height and width."""
+
 WIDTH = _names("image_width width w img_width")
 HEIGHT = _names("image_height height h img_height")
 
@@ -76,7 +81,7 @@ PERSPECTIVE_MODELS = _names("""
     rationalpolynomial opencv fullopencv simpleradial radial
 """)
 FISHEYE_MODELS = _names(
-    "equidistant fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8"
+    "equidistant fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 kb4"
 )
 MODELS = dict.fromkeys(PERSPECTIVE_MODELS, RADIAL_TANGENTIAL) | dict.fromkeys(
     FISHEYE_MODELS, FISHEYE
@@ -92,6 +97,9 @@ UNSUPPORTED = _names("""
     ocam cylindrical orthographic thinprism panoram
 """)  # noqa: E501
 """Starts of models that are not OpenCV's."""
+
+UNSUPPORTED_OF_BASALT = _names("ds ucm")
+"""Whole names of such models."""
 
 PINHOLE_OF_ZEROS = _names("inversebrown modifiedbrown")
 """Starts of models of which a camera without distortion is a pinhole, as RealSense writes it."""
@@ -201,7 +209,7 @@ def _read_model(record: Record) -> str | None:
         )
         if is_pinhole:
             named.append(RADIAL_TANGENTIAL)
-        elif name in MODELS or name.startswith(UNSUPPORTED):
+        elif name in (*MODELS, *UNSUPPORTED_OF_BASALT) or name.startswith(UNSUPPORTED):
             named.append(_model_of(text))
     if not named:
         return None if flag is None else RADIAL_TANGENTIAL
@@ -215,9 +223,13 @@ def _other_models(record: Record) -> list[str]:
         ("model", REALSENSE_MODELS, "coeffs"),
         ("camera_type", DEPTHAI_MODELS, "distortion_coeff"),
     ):
-        index = record.get(key)
-        if record.has(coefficients) and isinstance(index, int) and 0 <= index < len(models):
-            names.append(models[index])
+        index = record.get(key)  # a float in YAML and XML
+        if (
+            record.has(coefficients)
+            and isinstance(index, int | float)
+            and index in range(len(models))
+        ):
+            names.append(models[int(index)])
     return names
 
 
@@ -262,6 +274,12 @@ def _single_coefficients(record: Record, model: str | None) -> list[float]:
     singles = {name: record.number(name) for name in ORDER}
     if all(value is None for value in singles.values()):
         return []
+    is_like_fisheye = singles["k4"] and singles["p1"] is None and singles["k5"] is None
+    if model is None and is_like_fisheye:
+        raise InvalidInputError(
+            "distortion: k1 to k4 without p1 and p2 may be those of a fisheye; write "
+            "distortion_model: fisheye, or rational_polynomial, beside them"
+        )
     if model != FISHEYE:
         return padded([value or 0.0 for value in singles.values()])
     fisheye = [singles.pop(name) or 0.0 for name in ("k1", "k2", "k3", "k4")]
@@ -304,7 +322,7 @@ def _plain_camera(record: Record) -> CameraRecord:
     model = _read_model(record)
     matrix = _read_matrix(record)
     distortion = _read_distortion(record, model)
-    if model is None and len(distortion) == 4 and flattened(record.get(*DISTORTION)):
+    if model is None and len(flattened(record.get(*DISTORTION))) == 4:
         warnings.warn(
             CurviregWarning(
                 "4 coefficients of a lens without a model are read as k1, k2, p1, p2; "
@@ -336,9 +354,9 @@ def _unknown_order(record: Record) -> CameraRecord:
     return replace(camera, size=min(camera.size, camera.size[::-1], key=distance))
 
 
-def _has_pair_of_sides(record: Record) -> bool:
+def _has_shape(record: Record) -> bool:
     has_matrix = 9 in record.lengths(*MATRIX) or record.has(*FOCAL[0])
-    return has_matrix and isinstance(record.get(*SIZES), list)
+    return has_matrix and isinstance(record.get(*SHAPES), list)
 
 
 def _is_matlab(record: Record) -> bool:
@@ -356,7 +374,7 @@ def _matlab(record: Record) -> CameraRecord:
 
 
 def _is_own_result(record: Record) -> bool:
-    return record.get("model") in CAMERA_MODELS
+    return record.get("model") in CAMERA_MODELS and not record.has(*WIDTH)
 
 
 def _own_result(record: Record) -> CameraRecord:
@@ -567,7 +585,7 @@ FORMATS = (
     Format("P|projection_matrix|binning_x|roi", _ros, {"P": _ros_rectified}, also=_is_plain),
     Format("matrix model", _own_result, also=_is_own_result),
     Format("", _matlab, also=_is_matlab),
-    Format("", _unknown_order, also=_has_pair_of_sides),
+    Format("", _unknown_order, also=_has_shape),
     Format("", _plain_camera, also=_is_plain),
 )
 """The first that detects a dict reads it."""

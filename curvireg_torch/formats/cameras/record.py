@@ -14,9 +14,9 @@ Used = set[tuple[int, str]]
 """Keys that were read, each with the identity of its dict."""
 
 _DISTORTION_KEY = re.compile(
-    r"([kp]\d|[bs][1-4]|d|kc|tau[xy])$"  # coefficients and vectors of them
+    r"([kp]\d|[bs][1-4]|d|kc|xi|tau[xy])$"  # coefficients and vectors of them
     r"|dist(?!ance|r)|radial|tangential|thinprism|affin"
-    r"|(?!undist|perframeintrinsic).*(distort|coef|skew)"
+    r"|(?!undist|perframeintrinsic|num).*(distort|coef|skew)"
 )
 """Keys, without case and punctuation, whose numbers describe a lens."""
 
@@ -144,8 +144,13 @@ def distortion_keys(value: Any, others: Container[int]) -> Iterator[tuple[int, s
 def distortion_keys_inside(values: Document, others: Container[int]) -> Iterator[tuple[int, str]]:
     """:func:`distortion_keys` of a dict that counts, whoever else it belongs to."""
     for key, value in values.items():
+        name = plain(key)
+        if name == "covariance":
+            continue
         is_camera = id(value) in others
-        if not is_camera and _DISTORTION_KEY.match(plain(key)) and _has_number(value):
+        is_projection = name in ("p1", "p2") and len(flattened(value)) == 12
+        is_lens = _DISTORTION_KEY.match(name) and not is_projection
+        if not is_camera and is_lens and _has_number(value):
             yield id(values), key
         yield from distortion_keys(value, others)
 
