@@ -29,6 +29,7 @@ MAX_ARRAYS = 1000  # of an .npz file
 MAX_TOML_BYTES = 1 << 15
 MAX_TOML_PARTS = 100
 _TOML = re.compile(r"(?:\s|#[^\n]*+\n)*+(?:\[[A-Za-z_][^\]\n]*+\]|\w++[ \t]*+=)")
+_COMMENT = re.compile(r"^[ \t]*+//.*", re.MULTILINE)
 _COLMAP_LINE = re.compile(r"^\d+[ \t]+[A-Z][A-Z_]+[ \t]", re.MULTILINE)
 _YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _WORDS = {"": None, "~": None, "null": None, "true": True, "false": False}  # of YAML
@@ -63,15 +64,14 @@ def read_document(file: Path, expected: str = EXPECTED) -> Any:
         if _TOML.match(text):
             return _toml(text, expected)
         if start and start in "{[" and file.suffix.lower() not in (".yaml", ".yml"):
-            return json.loads(re.sub(r"(?m)^\s*//.*", "", text))  # comments of OpenCV
+            return _json(text)
         if start == "<":
             root = read_xml(data)
             return {root.tag: _element(root)}
+    except InvalidInputError:
+        raise
     except (ValueError, RecursionError) as error:
-        advice = "write it again"
-        if isinstance(error, json.JSONDecodeError) and error.msg == "Extra data":
-            advice = "write one of its JSON values as a file"
-        raise InvalidInputError(f"damaged ({error}); {advice}; expected {expected}") from error
+        raise InvalidInputError(f"cannot be read: {error}; write it again as {expected}") from error
     return _colmap(text) if _COLMAP_LINE.search(text) else _yaml(text, expected)
 
 
@@ -108,7 +108,7 @@ def number(text: str) -> float | str:
 
 
 def _arrays(data: bytes) -> Fields:
-    """Small arrays of numbers in a file of ``numpy.savez`` or ``numpy.save``, by their names."""
+    """Small arrays in a file of ``numpy.savez`` or ``numpy.save``, by their names."""
     try:
         if not data.startswith(b"PK"):
             return {"K": _array(data)}
@@ -123,25 +123,35 @@ def _arrays(data: bytes) -> Fields:
 
 
 def _array(data: bytes) -> Any:
-    """The values of a file of ``numpy.save``: numbers, bools, a text; None of objects, which are
-    not loaded, and of lists of texts."""
+    """The values of a file of ``numpy.save``, numbers, or one flag or text; None of others, and of
+    objects, which are not loaded."""
     try:
         array = np.load(BytesIO(data), allow_pickle=False)
     except ValueError as error:
         if "allow_pickle" in str(error):
             return None
         raise
-    if array.dtype.kind in "fiu":
-        array = array.astype(np.float64)
-    elif array.dtype.kind != "b" and not (array.dtype.kind == "U" and array.ndim == 0):
-        return None
-    return array.tolist()
+    if array.ndim == 0 and array.dtype.kind in "Ub":
+        return array.item()
+    return array.astype(np.float64).tolist() if array.dtype.kind in "fiu" else None
 
 
 def _colmap(text: str) -> Fields:
     """The words of each line of ``cameras.txt``, by the camera's number."""
     lines = enumerate((line.partition("#")[0].split() for line in text.splitlines()), start=1)
     return {words[0]: {"colmap": words, "line": count} for count, words in lines if words}
+
+
+def _json(text: str) -> Any:
+    """The values of JSON, in which OpenCV writes comments."""
+    try:
+        return json.loads(_COMMENT.sub("", text))
+    except json.JSONDecodeError as error:
+        if error.msg != "Extra data":
+            raise
+        raise InvalidInputError(
+            "several documents of JSON, as the lines of results.jsonl; give one line as a file"
+        ) from error
 
 
 def _toml(text: str, expected: str) -> Any:
