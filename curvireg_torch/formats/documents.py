@@ -147,7 +147,7 @@ def _json(text: str) -> Any:
     try:
         return json.loads(_COMMENT.sub("", text))
     except json.JSONDecodeError as error:
-        if error.msg != "Extra data":
+        if error.msg != "Extra data" or error.doc[error.pos] not in "{[":
             raise
         raise InvalidInputError(
             "several documents of JSON, as the lines of results.jsonl; give one line as a file"

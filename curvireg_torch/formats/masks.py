@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 MAX_LABEL = 127  # of a picture of 8 bits that counts as one of labels: brighter ones are white
-MAX_LISTED = 12  # labels that a message names
+MAX_LISTED = 12  # labels that a message names; a palette of more is none of labels
 VOID = 255  # index of a palette of labels for pixels that are of none, as borders of PASCAL VOC
 
 
@@ -98,11 +98,14 @@ def mask_of_values(values: Array, largest: int) -> Singles:
     """(H, W) in [0, 1] of a picture's values, of which ``largest`` is white; of a label image, of
     its only label."""
     limit = largest * MAX_LABEL / 255
-    labels = np.unique(values[(values > 0) & (values < largest)])
-    has_white = bool((values == largest).any())
-    if labels.max(initial=0) > limit or (has_white and not labels.size):
+    is_label = (values > 0) & (values < largest)
+    labels = np.unique(values[is_label])
+    white_pixels = int((values == largest).sum())
+    has_white = white_pixels > 0
+    # an edge that is soft, or was compressed, has fewer pixels than the object
+    if labels.max(initial=0) > limit or (has_white and is_label.sum() < white_pixels):
         return np.asarray(values / largest, dtype=np.float32)
-    if len(labels) > 1 or (has_white and labels.size):
+    if len(labels) > 1 or has_white:
         white = "white pixels, which may be void, and" if has_white else "no white pixel, but"
         raise InvalidInputError(
             f"mask: {white} labels {listed(labels, MAX_LISTED)}; choose one as FILE:LABEL, or "
@@ -122,11 +125,13 @@ def _labelled(values: Array, label: int, file: Path) -> Singles:
 
 
 def _values(image: "Image", is_of_labels: bool) -> tuple[Array, int]:
-    """(H, W) values of an open picture, and the value of white; float32 of transparency."""
-    if image.has_transparency_data and not is_of_labels:
+    """(H, W) values of an open picture, and the value of white; those of transparency are a mask in
+    float32."""
+    is_palette_of_labels = image.mode == "P" and len(np.unique(np.asarray(image))) <= MAX_LISTED
+    if image.has_transparency_data and not (is_of_labels or is_palette_of_labels):
         alpha = np.asarray(image.convert("RGBA"))[..., 3]
         if alpha.min() != alpha.max():
-            return np.asarray(alpha / 255, dtype=np.float32), 1
+            return np.asarray(alpha / alpha.max(), dtype=np.float32), 1
     if image.mode == "P":
         return (np.asarray(image), 255) if is_of_labels else _of_palette(image)
     if image.mode == "1":

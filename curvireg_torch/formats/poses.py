@@ -226,7 +226,7 @@ def _ros(record: Record) -> PoseRecord:
     """A PoseStamped, as ``--format ros`` writes it: metres, in the camera's optical frame."""
     header = record.inside("header")
     frame = str((header and header.get("frame_id")) or "")
-    if "optical" not in frame and _OTHER_FRAMES.search(frame):
+    if "optical" not in frame.rpartition("/")[2] and _OTHER_FRAMES.search(frame):
         raise InvalidInputError(
             f"frame_id {frame!r:.60} is not the camera's optical frame (x right, y down, z "
             f"forward); transform the pose into that, as tf2 does"

@@ -262,7 +262,7 @@ def register_list(
         store = run_entries(usable, out, open_registrar, label="register", **how)
         asked = {entry.name for entry in entries}
         if removed := sum(photo not in asked for photo in store.photos()):
-            text = f"{out}: results of photographs that are not asked for any more go: {removed}"
+            text = f"{out}: removed results of photographs that the list no longer has: {removed}"
             warnings.warn(text, CurviregWarning, stacklevel=2)
         return _write_tables(entries, out, store)
 

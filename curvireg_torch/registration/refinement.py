@@ -201,7 +201,7 @@ def refine_one(
     poses = _fitted(target, item, described, crops, T)
     evidence = evidence_of(target, described, poses)
     scores = evidence.scores(target.score_weights(exact=True))
-    symmetries = target.symmetries_of_answers(feature_is_hidden=False)
+    symmetries = target.symmetries_of(exact=True)
     distinct = distinct_poses(poses.rotation, scores, symmetries, angle=settings.same_pose_angle)
     order = scores.argsort(descending=True, stable=True)
     order = order[distinct[order]]
@@ -230,9 +230,10 @@ def refine_one(
             registered.confidence_bound,
             1.0 if limit is None else limit,
         )
-        others = [registered.probabilities[k] for k in siblings]
-        probabilities = (probability, *others, *[0.0] * (len(hypotheses) - 1))
-        hypotheses = (hypotheses[0], *[registered.hypotheses[k] for k in siblings], *hypotheses[1:])
+        rivals = [registered.hypotheses[k] for k in siblings]
+        of_rivals = [min(registered.probabilities[k], probability) for k in siblings]
+        probabilities = (probability, *of_rivals, *[0.0] * (len(hypotheses) - 1))
+        hypotheses = (hypotheses[0], *rivals, *hypotheses[1:])
         warnings = registered.warnings
         feature_is_hidden = registered.feature_is_hidden
     return Registration(

@@ -181,7 +181,7 @@ class Rig:
         self.photographs = photographs
         self.exact = target.is_exact
         self.score_weights = target.score_weights(exact=self.exact)
-        # which the views of the bank do not tell apart
+        # the ranking does not see small features
         self.symmetries = _rotations(target.symmetries_of(exact=self.exact))
         self.feature_is_hidden = all(p.result.feature_is_hidden for p in photographs)
         self.answer_symmetries = _rotations(
@@ -281,10 +281,11 @@ class Rig:
                 kept.append(k)
         return torch.tensor(kept)
 
-    def angles(self, T: Tensor, others: Tensor) -> Tensor:
+    def angles(self, T: Tensor, others: Tensor, shape_alone: bool = False) -> Tensor:
         """(M, N) degrees between the rotations of poses (M, 4, 4) and (N, 4, 4), up to symmetries
-        after which they are the same answer."""
-        return angles_between(T[:, :3, :3], others[:, :3, :3], self.answer_symmetries)
+        after which they are the same answer, or of the shape alone."""
+        symmetries = self.symmetries if shape_alone else self.answer_symmetries
+        return angles_between(T[:, :3, :3], others[:, :3, :3], symmetries)
 
     def ranks(self, T: Tensor) -> Tensor:
         """(V, M) log S of the best view of the bank near world poses, minus that of the best view

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..evidence import RANK_ALONE, EvidenceWeights
 from ..fitting.keypoints import KeypointMatches, Keypoints
 from ..geometry.framing import CropFrame, around_visible, border_sides, photograph_box
-from ..geometry.viewpoint import angles_between, rotation_error
+from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber, ViewMatcher
 from ..matching.detector import Detector
 from ..mesh import Mesh, mesh_radius, mesh_symmetries
@@ -52,18 +52,18 @@ class TellingSymmetries:
 
 def telling_symmetries(mesh: trimesh.Trimesh, symmetries: Tensor) -> TellingSymmetries:
     """Those of the symmetries (S, 4, 4) of a mesh's shape that a small feature tells from the
-    identity; at most ``MAX_SIBLINGS``, far from each other, of which each stands for those that are
-    nearest to it."""
+    identity, at most ``MAX_SIBLINGS``, far from each other; and all others."""
     if len(symmetries) == 1:
         return TellingSymmetries(symmetries, symmetries)
     chosen = spread(symmetries)
     fractions = feature_fractions(mesh, chosen)
-    told = fractions > FEATURE_FRACTION
-    told[0] = False
-    nearest = angles_between(symmetries[:, :3, :3], chosen[:, :3, :3]).argmin(dim=1)
-    telling = told.index_fill(0, torch.tensor([0]), True)
+    telling = fractions > FEATURE_FRACTION
+    others = symmetries
+    if bool(telling.any()):
+        others = symmetries[feature_fractions(mesh, symmetries) <= FEATURE_FRACTION]
+    telling[0] = True
     notable = bool(fractions.max() >= NOTABLE_FRACTION)
-    return TellingSymmetries(chosen[telling], symmetries[~told[nearest]], notable)
+    return TellingSymmetries(chosen[telling], others, notable)
 
 
 def spread(symmetries: Tensor) -> Tensor:
@@ -156,9 +156,11 @@ class Target:
         """(S, 4, 4) after which a pose is the same answer: :meth:`symmetries_of` the mesh without
         those that a small feature tells apart, unless it is not notable and
         ``feature_is_hidden``."""
+        if not self.is_exact:
+            return self.symmetries
         telling = self.telling_symmetries
         if len(telling) == 1 or (feature_is_hidden and not telling.notable):
-            return self.symmetries_of(exact=self.is_exact)
+            return self.symmetries_of(exact=True)
         return telling.others
 
     @cached_property

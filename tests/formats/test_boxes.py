@@ -106,6 +106,8 @@ def test_a_polygon_may_end_with_the_number_1_of_a_tracker(write):
     assert (box.corners, box.score, box.track) == ((0.1, 0.2, 0.3, 0.4), 0.9, "1")
     with refused("line 1: ends with a corner on the border, or with a score and the tracker's num"):
         read_boxes(write("a.txt", f"{outline} 0.9 1"))
+    (box,) = read_boxes(write("a.txt", f"{outline} 0.9 1.000000"))
+    assert box.corners == (0.1, 0.2, 0.9, 1.0), "a tracker's number has no decimals"
     (box,) = read_boxes(write("a.txt", f"{outline} 0.3 0.995 0.2 1"))
     assert box.corners == (0.1, 0.2, 0.3, 1.0), "either way"
     (box,) = read_boxes(write("a.txt", "0 0.25 0.75 0.5 0.5 0.75 0.75 0.5 1"))

@@ -116,6 +116,7 @@ JSON = {
     ),
     "shape of an array": ({"K": MATRIX, "image_shape": [480, 640, 3]}, (), VGA),
     "height first": ({**FLAT, "image_shape": [480, 640]}, (), VGA),
+    "size with the height first": ({**FLAT, "image_size": [480, 640]}, (), VGA),
     "not our matrix": ({"matrix": MATRIX, "size": [640, 480]}, (), VGA),
     "record3d": (
         {

@@ -91,6 +91,10 @@ def test_void_of_label_images_is_neither_white_nor_the_object(tmp_path):
     with refused("white pixels, which may be void, and labels 1; choose one as FILE:LABEL"):
         read_mask(written(tmp_path / "grey.png", labels))
     check(f"{tmp_path / 'grey.png'}:1")
+    soft = 255 * (labels > 0).astype(np.uint8)
+    soft[3, 5:9] = 64
+    mask = read_mask(written(tmp_path / "soft.png", soft))
+    assert mask[3, 5] == pytest.approx(64 / 255), "few dark pixels are an edge"
     labels[0] = 200
     picture.frombytes(labels.tobytes())
     picture.save(tmp_path / "two.png")

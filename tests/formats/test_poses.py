@@ -133,6 +133,7 @@ def test_opengl_poses_look_along_minus_z(read):
         ({"rotation": R.tolist()}, "no translation; expected JSON"),
         ([], "expected JSON with rotation and translation, or T_cam_from_model"),
         ("text", "expected JSON with rotation"),
+        ('{"a": 1}}', "cannot be read: Extra data.*; write it again as JSON with rotation"),
         ('{"a": }', "cannot be read: Expecting .*; write it again as JSON with rotation"),
         (
             '{"a": 1}\n{"a": 2}\n',

@@ -101,7 +101,7 @@ def test_results_of_photographs_that_a_list_no_longer_names_go(register_rows, en
     pictures = out / "thumbnails"
     (pictures / "holiday.jpg").write_text("of the user")
     assert len(list(pictures.iterdir())) == 3
-    with pytest.warns(CurviregWarning, match="out: results of photographs .* go: 1$"):
+    with pytest.warns(CurviregWarning, match="out: removed results of photographs .* has: 1$"):
         register_rows(rows[:1])
     (row,) = lines(out)
     left = {path.name for path in pictures.iterdir()}

@@ -29,6 +29,7 @@ def photograph(index, *, angle=0.0, ranking_share=0.5, **changes):
         "warnings": (),
         "distance": 2.0,
         "notes": (),
+        "feature_is_hidden": False,
         "ranking": None,
         "confidence_features": {"ranking_share": ranking_share},
     }
@@ -78,8 +79,8 @@ class FakeRig:
     def weights(self, _):
         return double([self.vote.get(p.index, 1.0) for p in self.photographs])
 
-    def angles(self, poses, _):
-        return poses[:, 0, 0]
+    def angles(self, poses, _, shape_alone):
+        return poses[:, 0, 0] * (not shape_alone)
 
     def centres(self, poses):
         return poses[:, :3, 3]
@@ -148,13 +149,20 @@ def test_an_object_that_was_searched_for_is_as_likely_as_its_clearest_place(monk
 
 
 @pytest.mark.parametrize(
-    ("confidence", "angle", "factor"),
-    [(0.9, 90.0, 1.0 / 9.0), (0.9, 20.0, 1.0), (0.3, 90.0, 1.0), (0.5, 31.0, 1.0)],
+    ("confidence", "angle", "is_hidden", "factor"),
+    [
+        (0.9, 90.0, False, 1.0 / 9.0),
+        (0.9, 90.0, True, 1.0),
+        (0.9, 20.0, False, 1.0),
+        (0.3, 90.0, False, 1.0),
+        (0.5, 31.0, False, 1.0),
+    ],
 )
 def test_photographs_that_are_confident_of_another_pose_lower_the_odds(
-    monkeypatch, confidence, angle, factor
+    monkeypatch, confidence, angle, is_hidden, factor
 ):
-    other = photograph(2, confidence=confidence, angle=angle)
+    """Not of another turn whose feature they hide."""
+    other = photograph(2, confidence=confidence, angle=angle, feature_is_hidden=is_hidden)
     scores = SCORES | {2: [1.0, 5.0, 1.0]}
     result = joint(monkeypatch, two() | {2: other}, scores, missing={2: "elsewhere"})
     odds = factor * TOGETHER[0] / (1.0 - TOGETHER[0])

@@ -8,6 +8,7 @@ import pytest
 import torch
 import trimesh
 
+from curvireg_torch import Registrar
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.registration.target import MAX_SIBLINGS, spread, telling_symmetries
@@ -209,6 +210,38 @@ def test_telling_symmetries_are_those_that_a_feature_breaks():
     assert rotation_error(others[1, :3, :3], about_z) < 1.0
     mesh, group = cylinder()
     assert torch.equal(telling_symmetries(mesh, group).others, group)
+
+
+def test_no_other_symmetry_is_one_that_the_feature_breaks():
+    """Of 24 turns of a cube, those about the middle of the block remain."""
+    cube = trimesh.creation.box((100, 100, 100))
+    block = trimesh.creation.box((24, 24, 14))
+    block.apply_translation((0, 0, 57))
+    mesh = trimesh.util.concatenate([cube, block])
+    group = mesh_symmetries(cube)
+    assert len(group) == 24
+    others = telling_symmetries(mesh, group).others
+    assert rotation_error(others[:, :3, :3], eye(3)).sort().values.tolist() == pytest.approx(
+        [0.0, 90.0, 90.0, 180.0], abs=1.0
+    )
+    block.apply_translation((30, 20, 0))
+    mesh = trimesh.util.concatenate([cube, block])
+    assert torch.equal(telling_symmetries(mesh, group).others, eye(4)[None])
+
+
+def test_symmetries_of_answers_depend_on_what_the_photograph_shows():
+    def answers(target, *, is_hidden):
+        return len(target.symmetries_of_answers(feature_is_hidden=is_hidden))
+
+    registrar = block_on_top()
+    assert [answers(registrar, is_hidden=one) for one in (False, True)] == [1, 1]
+    small = registrar_of(marked_box())
+    assert not small.telling_symmetries.notable
+    assert [answers(small, is_hidden=one) for one in (False, True)] == [1, 4]
+    given = exact_registrar(small.bank, symmetries=mesh_symmetries(marked_box()))
+    assert [answers(given, is_hidden=one) for one in (False, True)] == [4, 4]
+    similar = Registrar(small.bank, mesh_is="similar")
+    assert similar.symmetries_of_answers(feature_is_hidden=True) is None
 
 
 def test_spread_keeps_few_symmetries_far_apart():

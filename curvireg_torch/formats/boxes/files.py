@@ -98,7 +98,7 @@ def _refused(what: str) -> InvalidInputError:
 def _yolo(text: str) -> Iterator[ImageBox]:
     """Lines of CLASS and numbers: a box, an oriented box or a polygon, behind which a score and a
     tracker's number may stand: behind all lines of a file, or none."""
-    rows: list[tuple[int, str, tuple[float, ...]]] = []
+    rows: list[tuple[int, list[str], tuple[float, ...]]] = []
     for count, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words:
@@ -110,18 +110,19 @@ def _yolo(text: str) -> Iterator[ImageBox]:
         if len(numbers) < 4 or not all(map(math.isfinite, numbers)):
             expected = "CLASS CX CY WIDTH HEIGHT [SCORE], or CLASS X0 Y0 X1 Y1 X2 Y2 ..., of YOLO"
             raise _refused(f"line {count}: expected {expected}")
-        rows.append((count, words[0], numbers))
+        rows.append((count, words, numbers))
     ends = [numbers[-1] for *_, numbers in rows]
     are_tracks = {end > 1.0 and end == int(end) for end in ends if end != 1.0}
     has_tracks = are_tracks.pop() if len(are_tracks) == 1 else None
-    for count, label, numbers in rows:
-        box = _yolo_box(numbers, has_tracks)
+    for count, words, numbers in rows:
+        # a tracker's number has no decimals
+        box = _yolo_box(numbers, False if "." in words[-1] else has_tracks)
         if box is None:
             raise InvalidInputError(
                 f"line {count}: ends with a corner on the border, or with a score and the "
                 "tracker's number 1; begin it with another corner, or leave the number out"
             )
-        yield replace(box, labels=frozenset((label,)))
+        yield replace(box, labels=frozenset((words[0],)))
 
 
 def _yolo_box(numbers: Sequence[float], has_tracks: bool | None) -> ImageBox | None:

@@ -58,11 +58,6 @@ SIZES = _names("""
     resolution image_size img_size image_resolution size image_shape img_shape image_dimensions imsize frame_size
     dim img_dim intrinsic_matrix_reference_dimensions
 """)  # noqa: E501
-SHAPES = _names("""
-    resolution image_resolution image_shape img_shape image_dimensions intrinsic_matrix_reference_dimensions
-""")  # noqa: E501
-"""Those of pairs that may be height and width."""
-
 WIDTH = _names("image_width width w img_width")
 HEIGHT = _names("image_height height h img_height")
 
@@ -111,6 +106,7 @@ DEPTHAI_MODELS = _names("perspective fisheye equirectangular division")
 """The same of DepthAI."""
 
 
+NEAR_CENTRE = 0.1  # distance of a principal point from the centre, as a fraction of the sides
 MAX_FRACTION = 4.0  # of focal lengths and principal points in fractions of the picture
 
 
@@ -274,7 +270,8 @@ def _single_coefficients(record: Record, model: str | None) -> list[float]:
     singles = {name: record.number(name) for name in ORDER}
     if all(value is None for value in singles.values()):
         return []
-    is_like_fisheye = singles["k4"] and singles["p1"] is None and singles["k5"] is None
+    no_others = all(singles[name] is None for name in ("p1", "p2", "k5"))
+    is_like_fisheye = singles["k4"] and no_others
     if model is None and is_like_fisheye:
         raise InvalidInputError(
             "distortion: k1 to k4 without p1 and p2 may be those of a fisheye; write "
@@ -341,8 +338,8 @@ def _is_plain(record: Record) -> bool:
 
 
 def _unknown_order(record: Record) -> CameraRecord:
-    """MegaPose writes height, width and others width, height: the principal point lies near the
-    centre."""
+    """MegaPose writes height, width and others width, height: the former is taken where the
+    principal point lies near the centre of such a picture, and nearer than of the latter."""
     camera = _plain_camera(record)
     if camera.size is None:
         return camera
@@ -351,12 +348,14 @@ def _unknown_order(record: Record) -> CameraRecord:
     def distance(size: Size) -> float:
         return abs(cx / size[1] - 0.5) + abs(cy / size[0] - 0.5)
 
-    return replace(camera, size=min(camera.size, camera.size[::-1], key=distance))
+    turned = camera.size[::-1]
+    is_turned = distance(turned) < min(NEAR_CENTRE, distance(camera.size))
+    return replace(camera, size=turned) if is_turned else camera
 
 
-def _has_shape(record: Record) -> bool:
+def _has_pair_of_sides(record: Record) -> bool:
     has_matrix = 9 in record.lengths(*MATRIX) or record.has(*FOCAL[0])
-    return has_matrix and isinstance(record.get(*SHAPES), list)
+    return has_matrix and isinstance(record.get(*SIZES), list)
 
 
 def _is_matlab(record: Record) -> bool:
@@ -585,7 +584,7 @@ FORMATS = (
     Format("P|projection_matrix|binning_x|roi", _ros, {"P": _ros_rectified}, also=_is_plain),
     Format("matrix model", _own_result, also=_is_own_result),
     Format("", _matlab, also=_is_matlab),
-    Format("", _unknown_order, also=_has_shape),
+    Format("", _unknown_order, also=_has_pair_of_sides),
     Format("", _plain_camera, also=_is_plain),
 )
 """The first that detects a dict reads it."""

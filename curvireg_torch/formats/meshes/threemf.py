@@ -159,7 +159,12 @@ class _Package:
     def leave_out_modifiers(self, model: _Model) -> None:
         """Take out of the first model what the settings of slicers say is no material."""
         for name in filter(self._names.__contains__, _SETTINGS):
-            for given in read_xml(self._content(name)).iter("object"):
+            try:
+                settings = read_xml(self._content(name))
+            except ValueError:
+                self._source.warn("parts", f"{name} cannot be read: modifiers in it count as parts")
+                continue
+            for given in settings.iter("object"):
                 one = model.objects.get(given.get("id", ""))
                 if one is not None and _leave_out(one, given):
                     self._source.warn("parts", _MODIFIER_TEXT)
@@ -279,7 +284,7 @@ def _leave_out(one: _Object, settings: Element) -> bool:
         item for item in one.components if kinds.get(item[1], "normal_part") == "normal_part"
     ]
     volumes = [
-        (int(volume.get("firstid", "")), int(volume.get("lastid", "")))
+        (int(volume.get("firstid", "0")), int(volume.get("lastid", "-1")))
         for volume in settings.iter("volume")
         if not _is_solid(volume)
     ]
