@@ -118,6 +118,12 @@ def test_transparency_that_varies_is_the_mask(tmp_path):
     few = Image.fromarray(picture).quantize(64, method=Image.Quantize.FASTOCTREE)
     few.save(tmp_path / "palette.png")
     check(tmp_path / "palette.png")
+    labels = Image.fromarray(OBJECT.astype(np.uint8), "P")
+    labels.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    labels.putpixel((0, 0), 2)
+    labels.save(tmp_path / "labels.png", transparency=0)
+    with refused("no white pixel, but labels 1, 2"):
+        read_mask(tmp_path / "labels.png")
     picture[0, 0, 3] = 60  # no label
     found = read_mask(written(tmp_path / "soft.png", picture))
     assert np.allclose(found, picture[..., 3] / 255)

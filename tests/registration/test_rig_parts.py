@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.pipeline import Pipeline
@@ -81,6 +82,20 @@ def test_candidates_that_are_nearly_equal_count_once():
     assert rig.distinct(T, -score).tolist() == [5, 4, 2, 0]
     rig.answer_symmetries = torch.stack([eye(4), HALF_TURN])[:, :3, :3]
     assert rig.distinct(T, score).tolist() == [0, 2, 4]
+
+
+def test_a_photograph_alone_lowers_a_pose_by_at_most_five_points():
+    found = [
+        SimpleNamespace(evidence=evidence_of(0.9, 0.1).named(h), covariance=None) for h in (0, 1)
+    ]
+    alone = SimpleNamespace(result=SimpleNamespace(hypotheses=found), poses=turned(0.0, 90.0))
+    rig = rig_of(
+        around(0.0),
+        photographs=[alone],
+        cameras=eye(4).double()[None],
+        score_weights=EvidenceWeights.only(similarity=10.0),
+    )
+    assert rig.hypotheses_of_one().scores.tolist() == [pytest.approx([9.0, 4.0])]
 
 
 def photograph(index, sees):

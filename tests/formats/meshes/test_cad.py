@@ -340,6 +340,10 @@ def test_threemf_leaves_out_modifiers_of_slicers(read_3mf):
         mesh, texts = read_3mf(resources, f'<item objectid="{number}"/>', more=more)
         assert (len(mesh.faces), mesh.extents.tolist()) == (12, [30.0, 20.0, 10.0])
         assert [text.partition(": ")[2] for text in texts] == [said]
+    more = {"Metadata/Slic3r_PE_model.config": "<config>"}
+    mesh, (text,) = read_3mf(solid(1), '<item objectid="1"/>', more=more)
+    assert len(mesh.faces) == 12
+    assert "config cannot be read: modifiers in it count as parts" in text
 
 
 def test_threemf_reads_colours_and_textures(read_3mf):
