@@ -34,7 +34,7 @@ from ..jobs.outputs import output_folder
 from ..registration import FailedRegistration, Follower, Registrar, Registration, refine
 from ..registration.confidence import is_calibrated, two_decimals
 from ..registration.tracking import BELIEVED_CONFIDENCE, KEPT_CONFIDENCE
-from ..utils.aliases import Fields
+from ..utils.aliases import Fields, Size
 from ..utils.files import CsvFile
 from ..utils.threads import one_torch_thread
 from ..visualization import OverlayVideo
@@ -200,8 +200,7 @@ def _poses(
             is_first = False
             if isinstance(options.camera, Camera):
                 if options.camera.size is None:  # it is of frames as large as the first
-                    size = (image.shape[-2], image.shape[-1])
-                    options = replace(options, camera=options.camera.at(size))
+                    options = replace(options, camera=options.camera.at(_size(photo)))
                 seen = undistorted(
                     image, options.camera, None if box is None else torch.tensor(box)
                 )
@@ -248,7 +247,7 @@ def _box(
 ) -> list[float] | None:
     """The given box of the first frame, or a detector's of any; a frame that has none is searched
     for the object."""
-    size = (photo.image.shape[-2], photo.image.shape[-1])
+    size = _size(photo)
     if options.box is not None:
         if not is_first:
             return None
@@ -270,8 +269,13 @@ def _camera(options: RegisterOptions, photo: Photo) -> Camera | None:
     if camera is None:
         return None
     if not isinstance(options.camera, Camera):  # other cameras are those of frames of this size
-        camera = camera.at((photo.image.shape[-2], photo.image.shape[-1]))
+        camera = camera.at(_size(photo))
     return replace(camera, distortion=(), model="radial-tangential")
+
+
+def _size(photo: Photo) -> Size:
+    """(H, W) of a frame."""
+    return photo.image.shape[-2], photo.image.shape[-1]
 
 
 def _frames(path: Path) -> tuple[Iterator[Frame], int, float]:

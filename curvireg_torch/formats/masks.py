@@ -57,8 +57,8 @@ def read_mask(mask: PathName) -> Singles:
     Raises:
         MissingFileError: the file does not exist.
         ImageError: it cannot be read.
-        InvalidInputError: no pixel has the label, or several labels are there, or labels and white,
-            and none is chosen.
+        InvalidInputError: no pixel has the label, or none is chosen and there are several, or more
+            pixels of labels than of white.
 
     Example:
         >>> import tempfile
@@ -111,7 +111,7 @@ def mask_of_values(values: Array, largest: int) -> Singles:
             f"mask: {white} labels {listed(labels, MAX_LISTED)}; choose one as FILE:LABEL, or "
             "mask == LABEL"
         )
-    return np.asarray(np.isin(values, labels), dtype=np.float32)
+    return np.asarray(is_label, dtype=np.float32)
 
 
 def _labelled(values: Array, label: int, file: Path) -> Singles:

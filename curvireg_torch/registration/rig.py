@@ -281,7 +281,7 @@ class Rig:
                 kept.append(k)
         return torch.tensor(kept)
 
-    def angles(self, T: Tensor, others: Tensor, shape_alone: bool = False) -> Tensor:
+    def angles(self, T: Tensor, others: Tensor, *, shape_alone: bool = False) -> Tensor:
         """(M, N) degrees between the rotations of poses (M, 4, 4) and (N, 4, 4), up to symmetries
         after which they are the same answer, or of the shape alone."""
         symmetries = self.symmetries if shape_alone else self.answer_symmetries

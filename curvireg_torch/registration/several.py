@@ -302,7 +302,8 @@ def _joint_probabilities(
         is_elsewhere = not is_majority and bool(away > OTHER_PLACE * p.result.distance)
         # one that hides the feature does not contradict the turn that it tells
         shape_alone = p.result.feature_is_hidden
-        if is_elsewhere or rig.angles(p.poses[:1], answer.T[:1], shape_alone) > RIVAL_ANGLE:
+        angle = rig.angles(p.poses[:1], answer.T[:1], shape_alone=shape_alone)
+        if is_elsewhere or angle > RIVAL_ANGLE:
             other = p.result.confidence or 0.0
             odds *= min(1.0, (1.0 - other) / max(other, 1e-9))
     factor = odds / (1.0 + odds) / max(probabilities[0], 1e-9)

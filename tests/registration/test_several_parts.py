@@ -79,7 +79,7 @@ class FakeRig:
     def weights(self, _):
         return double([self.vote.get(p.index, 1.0) for p in self.photographs])
 
-    def angles(self, poses, _, shape_alone):
+    def angles(self, poses, _, *, shape_alone):
         return poses[:, 0, 0] * (not shape_alone)
 
     def centres(self, poses):

@@ -270,9 +270,8 @@ def _single_coefficients(record: Record, model: str | None) -> list[float]:
     singles = {name: record.number(name) for name in ORDER}
     if all(value is None for value in singles.values()):
         return []
-    no_others = all(singles[name] is None for name in ("p1", "p2", "k5"))
-    is_like_fisheye = singles["k4"] and no_others
-    if model is None and is_like_fisheye:
+    has_others = any(singles[name] is not None for name in ("p1", "p2", "k5"))
+    if model is None and singles["k4"] and not has_others:
         raise InvalidInputError(
             "distortion: k1 to k4 without p1 and p2 may be those of a fisheye; write "
             "distortion_model: fisheye, or rational_polynomial, beside them"
